@@ -8,8 +8,9 @@ import numpy as np
 from ..models.fields import Limits, immutable
 from .config import RolloutConfig, Share
 from .episodes import Mask
+from .layers import Floats
 from .learner import Learner
-from .networks import Floats
+from .memory import Sequences
 from .rollouts import Collector, Numbers, Rollout, advantages
 
 
@@ -46,40 +47,66 @@ class A2C(Learner):
 
     def gradient(self, rollout: Rollout) -> None:
         """Of minus the mean of A · log P, plus the weighted squared error of the value."""
-        gain, entropy, value_loss = self.minibatch(*self.columns(rollout))
+        sequences = self.sequences(rollout)
+        columns = self.columns(rollout)
+        gain, entropy, value_loss = self.minibatch(*columns, sequences=sequences)
         self.terms |= {"gain": gain, "entropy": entropy, "value_loss": value_loss}
 
     def columns(self, rollout: Rollout) -> list[Floats]:
-        """Arguments of `minibatch` for all transitions of a rollout. Begins the `terms`."""
+        """Arguments of `minibatch` for all transitions of a rollout. Begins the `terms`.
+
+        Moves the critic's memory to the end of the rollout.
+        """
         estimates, judged, seen = self.advantages(rollout)
-        advantage = rollout.rows(estimates).astype(np.float32)
-        values = rollout.rows(judged).astype(np.float32)
+        advantage = estimates.astype(np.float32)
+        values = judged.astype(np.float32)
         targets = values + advantage
-        self.terms = {"values": values, "targets": targets}
-        inputs = rollout.rows(self.inputs(rollout.observations, seen))
-        return [inputs, rollout.rows(rollout.actions), advantage, targets]
+        self.terms = {"values": rollout.rows(values), "targets": rollout.rows(targets)}
+        inputs = self.inputs(rollout.observations, seen)
+        columns = [inputs, rollout.actions, advantage, targets]
+        if self.config.memory:
+            return columns
+        return [rollout.rows(column) for column in columns]
+
+    def sequences(self, rollout: Rollout, which: int | slice = slice(2)) -> Sequences | None:
+        """The rollout as what the memories of actor (0) and critic (1) read; None without these."""
+        if not self.config.memory:
+            return None
+        states = np.stack((rollout.state, self._memory[1]))
+        return Sequences(states[which], rollout.begins, rollout.kept)
 
     def minibatch(
-        self, inputs: Floats, actions: Floats, advantage: Floats, targets: Floats, *before: Floats
+        self, inputs: Floats, *others: Floats, sequences: Sequences | None = None
     ) -> tuple[float, float, float]:
         """Set the gradients of the loss of B transitions; its gain, entropy and value loss.
 
-        Rows of `inputs` and (B, k) of actions, and shape (B,): advantages, `targets` of V(s), and
-        what else `objective` takes.
+        Rows of `inputs` and (B, k) of actions, and shape (B,): advantages, targets of V(s), and
+        what else `objective` takes. With a memory all of them have the shape (T, S, ...) of
+        `sequences`, and only their kept rows count.
         """
         config = self.config
+        if sequences is not None:
+            inputs = inputs.reshape(-1, *inputs.shape[2:])
+            others = tuple(column[sequences.kept] for column in others)
+        actions, advantage, targets, *before = others
         count = len(targets)
         if config.normalize and count > 1:
             advantage = advantage - advantage.sum() / count
             advantage /= math.sqrt(advantage.dot(advantage) / (count - 1)) + 1e-8
-        outputs = self._both.forward(inputs.T)
+        found = self._both.forward(inputs.T, sequences)
+        outputs = found
+        if sequences is not None:
+            outputs = found[..., sequences.kept.ravel()]
         log_probability, entropy = self._actor.head.score(outputs[0], actions.T)
         gains, weights = self.objective(log_probability, advantage, *before)
         errors = outputs[1, 0] - targets
         slopes = outputs  # the derivatives take the place of the outputs; others of them are 0
         slopes[0] = self._actor.head.back(weights * (-1 / count), -config.ent_coef)
         np.multiply(errors, 2 * config.vf_coef / count, out=slopes[1, 0])
-        self._both.backward(slopes)
+        if sequences is not None:
+            found[...] = 0.0
+            found[..., sequences.kept.ravel()] = slopes
+        self._both.backward(found)
         return float(gains.sum()) / count, entropy, float(errors.dot(errors)) / count
 
     def objective(self, log_probability: Floats, advantage: Floats) -> tuple[Floats, Floats]:
@@ -94,13 +121,20 @@ class A2C(Learner):
         """A_t and V(s_t) of every row, shape (T, N), and the inputs of the critic for them."""
         seen = self.seen(rollout.observations, rollout.kept)
         after = self.seen(rollout.next_observations, rollout.kept & ~rollout.terminated)
-        values = self._values(seen)
+        own = self.sequences(rollout, 1)
+        values = self._values(seen, own)
         following = np.empty_like(values)
         following[:-1] = values[1:]
         # The next row has the same observation, unless an episode ends between them.
         new = rollout.ends.copy()
         new[-1] = True
-        following[new] = self._values(after[new])
+        memory = self._critic.memory
+        if memory:
+            states = memory.states
+            self._memory[1] = np.where(rollout.ends[-1], np.float32(0.0), states[:, -1])
+            once = np.zeros((1, int(new.sum())), bool)
+            own = Sequences(states[:, new], once, once)
+        following[new] = self._values(after[new], own)
         estimates = advantages(
             rollout.rewards,
             values,
@@ -119,8 +153,8 @@ class A2C(Learner):
         """
         return observations
 
-    def _values(self, seen: Floats) -> Numbers:
+    def _values(self, seen: Floats, sequences: Sequences | None) -> Numbers:
         """V(s), shape (...), of inputs of the critic, shape (..., m)."""
         *lead, size = seen.shape
-        values = self._critic.forward(seen.reshape(-1, size).T)
+        values = self._critic.forward(seen.reshape(-1, size).T, sequences)
         return values.reshape(lead).astype(np.float64)

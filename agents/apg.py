@@ -11,8 +11,8 @@ from ..models.errors import InputError
 from ..models.fields import PositiveInt, immutable
 from .config import Config, Positive
 from .episodes import EpisodeRecorder
+from .layers import Floats
 from .learner import Learner
-from .networks import Floats
 from .optimizers import clip_norm
 from .rollouts import Collector, Rollout
 
@@ -37,6 +37,7 @@ class APG(Learner):
     config: APGConfig
 
     def __init__(self, log: EpisodeRecorder, config: APGConfig, seed: int) -> None:
+        config.check_forgetful("apg")
         super().__init__(log, config, seed)
         loop = getattr(log.env, "loop", None)
         machine = loop.machine() if isinstance(loop, CompiledLoop) else None
@@ -92,8 +93,5 @@ class APG(Learner):
             slope[sent != actions.middle + actions.half * drawn] = 0.0  # it was clipped
             slopes[step] = slope
             network.forward(rollout.observations[step].T)
-            back = slope.T
-            for layer in reversed(network.layers):
-                back = layer.back(back)
-            by_observations = back.T
+            by_observations = network.back(slope.T).T
         return slopes

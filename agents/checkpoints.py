@@ -26,7 +26,7 @@ from ..models.fields import check_fields, immutable
 from ..models.files import software_versions, write_whole
 from .config import Config
 from .episodes import Episode, Flown, Long, Position, ResumeError
-from .networks import ByName, Parts, named, part_of
+from .layers import ByName, Parts, named, part_of
 from .policies import NetworkPolicy
 from .presets import preset
 

@@ -5,11 +5,14 @@ from typing import Annotated, ClassVar, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from ..models.fields import Limits, PositiveInt, check_fields, immutable
+from ..models.errors import InputError
+from ..models.fields import Limits, NonNegativeInt, PositiveInt, check_fields, immutable
 
 Positive = Annotated[float, Limits(0.0, 1e30, above=True)]
 """A number above 0 that float32 holds."""
 Share = Annotated[float, Limits(0.0, 1.0)]
+Sizes = Annotated[tuple[int, ...], Limits(1, whole=True, count=0)]
+"""At least one, each at least 1."""
 
 
 @immutable
@@ -17,8 +20,12 @@ class Config:
     """Base of the hyperparameters of every algorithm. Raises `InputError` for a wrong one."""
 
     network: str = "mlp"
-    """Kind of the networks: see `networks.NETWORKS`."""
-    hidden: Annotated[tuple[int, ...], Limits(1, whole=True, count=0)] = (16,)
+    """`mlp`, or `cnn` with convolutions over images and rings: see `networks.NETWORKS`."""
+    filters: Sizes = (4, 8, 16)
+    """Filters of each convolution of a `cnn`."""
+    memory: NonNegativeInt = 0
+    """Units of a GRU before the hidden layers, which remembers an episode; 0: none."""
+    hidden: Sizes = (16,)
     """Units of each hidden layer of each network (paper: one of 16)."""
     activation: Literal["relu", "tanh"] = "relu"
     """Of the hidden units (paper: relu)."""
@@ -46,6 +53,11 @@ class Config:
         scaled = self.reward_scale * rewards
         most = self.reward_clip
         return scaled if most is None else np.clip(scaled, -most, most)
+
+    def check_forgetful(self, user: str) -> None:
+        """Raise `InputError`, which names the algorithm, for a memory that it cannot train."""
+        if self.memory:
+            raise InputError(f"memory: expected 0 with {user}, got {self.memory}; ppo trains one")
 
     def least_steps(self, drones: int, episode_length: int) -> int:
         """Env steps that a training needs for one update, with all drones together."""

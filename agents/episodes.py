@@ -17,7 +17,7 @@ from ..envs.autoreset import AdvancingVectorEnv, worlds_done
 from ..envs.spec import EnvSpec
 from ..models.errors import InputError
 from ..models.fields import Limits, immutable
-from .networks import Floats
+from .layers import Floats
 from .policies import ActionMap, Array, flat
 
 _BLOCK = 256  # Episodes

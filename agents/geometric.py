@@ -8,7 +8,7 @@ import numpy as np
 
 from ..envs.spec import EnvSpec, component_names
 from ..models.errors import InputError
-from .networks import ByName, Floats
+from .layers import ByName, Floats
 from .policies import Array, Observation, flat
 
 DAMPING = 0.5  # Damping ratio of a payload's swing

@@ -5,7 +5,7 @@ import math
 import numpy as np
 from numpy.random import Generator
 
-from .networks import Floats, Module, Weights
+from .layers import Floats, Module, Weights
 
 _LOG_STD = (np.float32(-4.0), np.float32(1.0))
 """Least and greatest logarithm of a standard deviation."""

@@ -10,9 +10,10 @@ import numpy as np
 
 from .config import Config
 from .episodes import EpisodeRecorder
-from .networks import ByName, Weights, make_network, named
+from .layers import ByName, Weights, named
+from .networks import make_network
 from .optimizers import Adam
-from .policies import NetworkPolicy, distances_in, flat_size
+from .policies import NetworkPolicy
 from .rollouts import Collector, Diverged, Rollout
 
 OnUpdate = Callable[[], bool]
@@ -50,9 +51,8 @@ class Learner:
         weights_seed, self._rng = seeds_of(seed)
         self._actor = actor = NetworkPolicy(log.spec, config)
         copies = len(log.spec.agents) if self.central else 1
-        inputs = copies * flat_size(log.spec)
-        seen = distances_in(log.spec, copies)
-        self._both = make_network(inputs, actor.actions.outputs, config, seen)
+        seen = copies * log.spec.observation
+        self._both = make_network(seen, actor.actions.outputs, config)
         count = 2 if self.has_critic else 1
         shapes = {**self._both.shapes, **actor.head.shapes}
         self.weights = Weights.zeros({name: (count, *shape) for name, shape in shapes.items()})
@@ -61,9 +61,12 @@ class Learner:
         rng = np.random.default_rng(weights_seed)
         actor.initialise(rng, config.log_std)
         if self.has_critic:
-            self._critic = make_network(inputs, 1, config, seen)
+            self._critic = make_network(seen, 1, config)
             self._critic.bind(self.weights.of_one(1, self._critic.shapes))
             self._critic.initialise(rng, 1.0)
+        self._memory = np.zeros((count, config.memory, log.num_envs), np.float32)
+        if actor.memory:
+            actor.memory.state = self._memory[0]
         self.optimizer = Adam(self.weights, self.epsilon)
 
     @abstractmethod
@@ -121,7 +124,8 @@ class Learner:
 
     def _state(self) -> ByName:
         """The state without the generator: no copies."""
-        return {"weights": self.weights.values, **named("optimizer.", self.optimizer.state)}
+        own = {"weights": self.weights.values, "memory": self._memory}
+        return own | named("optimizer.", self.optimizer.state)
 
     def scalars(self) -> dict[str, float]:
         """Numbers of the last update, as in `docs/algorithms/README.md`; none before the first."""

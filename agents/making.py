@@ -43,8 +43,8 @@ def resume_agent(kept: Checkpoint, log: EpisodeRecorder) -> Agent:
         kept.policy()  # its networks are those of the config
         agent = make_agent(kept.algorithm, log, kept.hyperparameters, kept.seed)
         if isinstance(agent, Learner):
-            agent.set_state(kept.state)
             log.resume(kept.position)
+            agent.set_state(kept.state)
     except ResumeError:
         raise
     except (LookupError, TypeError, ValueError, RuntimeError) as error:

@@ -3,7 +3,7 @@
 import numpy as np
 
 from .episodes import Mask
-from .networks import Floats
+from .layers import Floats
 from .ppo import PPO
 
 

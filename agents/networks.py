@@ -1,279 +1,76 @@
-"""Networks in NumPy: a sequence of layers with gradients by hand, and the kinds of networks.
+"""Kinds of networks: what they are built of, from the arrays that they see.
 
-Small networks are faster here than in torch, and torch is not imported. Arrays are feature-major:
-shape (..., n, B) for a batch of B. A leading axis counts networks of the same layers that compute
-together, as an actor and its critic. Between layers a row of ones comes first, so that the first
-column of the weights is the bias. Layers keep their arrays from batch to batch: what they return
-holds until their next call.
+Plain arrays enter as they are. A network with a memory carries a state from row to row.
 """
 
-import math
 from abc import abstractmethod
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
-from types import MappingProxyType
-from typing import TypeVar
+from collections.abc import Sequence
+from typing import ClassVar
 
 import numpy as np
-from numpy.random import Generator
-from numpy.typing import NDArray
 
+from ..envs.spec import ArraySpec
 from ..models.errors import InputError
 from .config import Config
+from .convolutions import Encoder, is_grid, slices
+from .layers import Affine, Chain, Floats, Layer, Nearness, Relu, Tanh, sized
+from .memory import GRU, Sequences
 
-Floats = NDArray[np.float32]
-Parts = dict[str, Floats]
-ByName = dict[str, np.ndarray]
-Shapes = Mapping[str, tuple[int, ...]]
-Item = TypeVar("Item")
-_ZERO, _QUARTER, _HALF, _ONE, _TWO = map(np.float32, (0.0, 0.25, 0.5, 1.0, 2.0))
+_ACTIVATIONS: dict[str, type[Layer]] = {"relu": Relu, "tanh": Tanh}
 
 
-def named(prefix: str, items: Mapping[str, Item]) -> dict[str, Item]:
-    """The same with a prefix to every name."""
-    return {prefix + name: item for name, item in items.items()}
+class Network(Chain):
+    """Layers in a row, from inputs (..., n, B) to outputs (..., k, B). Subclasses build the last.
 
-
-def part_of(items: Mapping[str, Item], prefix: str) -> dict[str, Item]:
-    """The items with names that begin so, without this prefix."""
-    return {k.removeprefix(prefix): item for k, item in items.items() if k.startswith(prefix)}
-
-
-def views(flat: Floats, shapes: Shapes) -> Parts:
-    """Arrays by name, one after the other, in a flat array."""
-    ends = np.cumsum([math.prod(shape) for shape in shapes.values()])[:-1]
-    parts = np.split(flat, ends)
-    named_parts = zip(shapes.items(), parts, strict=True)
-    return {name: part.reshape(shape) for (name, shape), part in named_parts}
-
-
-@dataclass(frozen=True)
-class Weights:
-    """Arrays by name and their gradients, all of them views of two flat arrays.
-
-    So Adam, the norm of a gradient and a copy are one call for all networks of an agent.
-    """
-
-    values: Floats
-    """Shape (P,)."""
-    slopes: Floats
-    """Derivatives of the loss by `values`, shape (P,)."""
-    arrays: Parts
-    gradients: Parts
-
-    @classmethod
-    def zeros(cls, shapes: Shapes) -> "Weights":
-        """Arrays of these shapes."""
-        size = sum(map(math.prod, shapes.values()))
-        values, slopes = np.zeros((2, size), np.float32)
-        return cls(values, slopes, views(values, shapes), views(slopes, shapes))
-
-    def part(self, prefix: str) -> "Weights":
-        """The arrays with names that begin so, without this prefix."""
-        arrays = part_of(self.arrays, prefix)
-        return replace(self, arrays=arrays, gradients=part_of(self.gradients, prefix))
-
-    def of_one(self, number: int, shapes: Shapes) -> "Weights":
-        """The arrays of one of the networks that compute together; it may be smaller."""
-
-        def own(arrays: Parts) -> Parts:
-            return {k: arrays[k][number][tuple(map(slice, shape))] for k, shape in shapes.items()}
-
-        return replace(self, arrays=own(self.arrays), gradients=own(self.gradients))
-
-
-def sized(array: Floats, *shape: int) -> Floats:
-    """The array if it has this shape, or new ones."""
-    return array if array.shape == shape else np.ones(shape, np.float32)
-
-
-class Module:
-    """What computes with weights.
+    Distances come in as nearness; then come the encoder and the memory, if it has them.
 
     Attributes:
-        shapes: Of its weights, by name.
+        memory: The layer that remembers, if there is one.
     """
 
-    shapes: Shapes = MappingProxyType({})
+    convolves: ClassVar[bool] = False
+    """Whether images and rings go through convolutions."""
 
-    def bind(self, weights: Weights) -> None:
-        """Compute with these arrays from now on; they have the shapes of `shapes`."""
-
-
-class Layer(Module):
-    """A step of a network, from inputs (..., 1 + n, B) to outputs (..., 1 + k, B)."""
-
-    def initialise(self, rng: Generator, gain: float) -> None:
-        """Draw the weights."""
-
-    @abstractmethod
-    def forward(self, inputs: Floats) -> Floats:
-        """The outputs. Keeps what the derivatives need."""
-
-    def learn(self, slope: Floats) -> None:
-        """Set the gradients of a loss, from its derivatives by the last outputs, (..., k, B)."""
-
-    @abstractmethod
-    def back(self, slope: Floats) -> Floats:
-        """Derivatives by the last inputs, (..., n, B), from those by the outputs.
-
-        It is called once, after `learn`, and may overwrite the slope and the outputs.
-        """
-
-
-class Affine(Layer):
-    """Sums of the inputs by weights, which are orthogonal at the beginning.
-
-    The first input is 1, and its weight the bias.
-    """
-
-    def __init__(self, inputs: int, outputs: int) -> None:
-        self.shapes = {"weight": (outputs, 1 + inputs)}
-
-    def bind(self, weights: Weights) -> None:
-        self.weight = weights.arrays["weight"]
-        self._by_weight = weights.gradients["weight"]
-        self._transposed = self.weight[..., 1:].swapaxes(-1, -2)
-        self._outputs = self._by_inputs = self.weight[..., :0]
-
-    def initialise(self, rng: Generator, gain: float) -> None:
-        units, inputs = self.weight.shape
-        self.weight[:, 0] = 0.0
-        self.weight[:, 1:] = orthogonal(rng, (units, inputs - 1), gain)
-
-    def forward(self, inputs: Floats) -> Floats:
-        self._inputs = inputs
-        *lead, units, _ = self.weight.shape
-        self._outputs = sized(self._outputs, *lead, 1 + units, inputs.shape[-1])
-        np.matmul(self.weight, inputs, out=self._outputs[..., 1:, :])
-        return self._outputs
-
-    def learn(self, slope: Floats) -> None:
-        np.matmul(slope, self._inputs.swapaxes(-1, -2), out=self._by_weight)
-
-    def back(self, slope: Floats) -> Floats:
-        *shape, _ = self._transposed.shape
-        self._by_inputs = sized(self._by_inputs, *shape, slope.shape[-1])
-        return np.matmul(self._transposed, slope, out=self._by_inputs)
-
-
-class Relu(Layer):
-    """max(x, 0), in the place of x."""
-
-    def forward(self, inputs: Floats) -> Floats:
-        self._outputs = inputs[..., 1:, :]
-        np.maximum(self._outputs, np.float32(0.0), out=self._outputs)
-        return inputs
-
-    def back(self, slope: Floats) -> Floats:
-        slope *= self._outputs > 0
-        return slope
-
-
-class Tanh(Layer):
-    """The hyperbolic tangent, in the place of x."""
-
-    def forward(self, inputs: Floats) -> Floats:
-        self._outputs = inputs[..., 1:, :]
-        np.tanh(self._outputs, out=self._outputs)
-        return inputs
-
-    def back(self, slope: Floats) -> Floats:
-        outputs = self._outputs
-        np.square(outputs, out=outputs)
-        np.subtract(np.float32(1.0), outputs, out=outputs)
-        slope *= outputs
-        return slope
-
-
-class Nearness(Layer):
-    """2 / (1 + d / 2 m) - 1 / 2 of distances d >= 0 m, in their place: what is near differs most.
-
-    `places` has the slices of the inputs that are distances; the others stay.
-    """
-
-    def __init__(self, places: Sequence[slice]) -> None:
-        self.places = places
-
-    def forward(self, inputs: Floats) -> Floats:
-        self._inputs = inputs
-        for place in self.places:
-            values = inputs[..., 1:, :][..., place, :]
-            np.maximum(values, _ZERO, out=values)
-            values *= _HALF
-            values += _ONE
-            np.divide(_TWO, values, out=values)
-            values -= _HALF
-        return inputs
-
-    def back(self, slope: Floats) -> Floats:
-        for place in self.places:
-            values = self._inputs[..., 1:, :][..., place, :] + _HALF
-            slope[..., place, :] *= -_QUARTER * values * values
-        return slope
-
-
-class Network(Module):
-    """Layers in a row, from inputs (..., n, B) to outputs (..., k, B). Subclasses build them.
-
-    Attributes:
-        layers: In the order of evaluation.
-        shapes: Of all weights: `layers.0.weight` and so on, counted by layers that have weights.
-    """
-
-    def __init__(
-        self, inputs: int, outputs: int, config: Config, distances: Sequence[slice] = ()
-    ) -> None:
-        """`distances`: which of the inputs are distances, m, of rays."""
-        self.layers = list(self.build(inputs, outputs, config))
-        if distances:
-            self.layers.insert(0, Nearness(distances))
-        with_weights = [layer for layer in self.layers if layer.shapes]
-        self._named = {f"layers.{i}.": layer for i, layer in enumerate(with_weights)}
-        shapes: dict[str, tuple[int, ...]] = {}
-        for prefix, layer in self._named.items():
-            shapes |= named(prefix, layer.shapes)
-        self.shapes = shapes
+    def __init__(self, arrays: Sequence[ArraySpec], outputs: int, config: Config) -> None:
+        """The inputs are these arrays, one after the other."""
+        inputs = sum(array.size for array in arrays)
+        layers: list[Layer] = []
+        if distances := distances_in(arrays):
+            layers.append(Nearness(distances))
+        if self.convolves and any(map(is_grid, arrays)):
+            encoder = Encoder(arrays, config.filters, _ACTIVATIONS[config.activation])
+            inputs = encoder.outputs
+            layers.append(encoder)
+        self.memory = GRU(inputs, config.memory) if config.memory else None
+        if self.memory:
+            inputs = config.memory
+            layers.append(self.memory)
+        super().__init__([*layers, *self.build(inputs, outputs, config)])
         self._inputs = np.ones(0, np.float32)
 
     @abstractmethod
     def build(self, inputs: int, outputs: int, config: Config) -> Sequence[Layer]:
-        """The layers, which allocate nothing yet."""
+        """The last layers, which allocate nothing yet."""
 
-    def bind(self, weights: Weights) -> None:
-        for prefix, layer in self._named.items():
-            layer.bind(weights.part(prefix))
+    def forward(self, inputs: Floats, sequences: Sequences | None = None) -> Floats:
+        """The outputs; the inputs stay as they are.
 
-    def initialise(self, rng: Generator, gain: float) -> None:
-        """Draw the weights, with the gain sqrt(2) but for the last layer that has weights."""
-        *others, last = self._named.values()
-        for layer in others:
-            layer.initialise(rng, math.sqrt(2))
-        last.initialise(rng, gain)
-
-    def forward(self, inputs: Floats) -> Floats:
-        """The outputs; the inputs stay as they are."""
+        With a memory the B rows are those of `sequences`, one time after the other. Without these
+        they are the next rows of B sequences that the memory itself follows.
+        """
         *lead, rows, count = inputs.shape
-        self._inputs = outputs = sized(self._inputs, *lead, 1 + rows, count)
-        outputs[..., 1:, :] = inputs
-        for layer in self.layers:
-            outputs = layer.forward(outputs)
-        return outputs[..., 1:, :]
+        self._inputs = sized(self._inputs, *lead, 1 + rows, count)
+        self._inputs[..., 1:, :] = inputs
+        if self.memory:
+            self.memory.sequences = sequences
+        return super().forward(self._inputs)[..., 1:, :]
 
     def backward(self, slope: Floats) -> None:
         """Set the gradients of a loss, from its derivatives by the last outputs, (..., k, B).
 
         Once after a `forward`; the slope and what that returned are overwritten.
         """
-        first = next(layer for layer in self.layers if layer.shapes)
-        for layer in reversed(self.layers):
-            layer.learn(slope)
-            if layer is first:
-                break
-            slope = layer.back(slope)
-
-
-_ACTIVATIONS = {"relu": Relu, "tanh": Tanh}
+        self.learn(slope)
 
 
 class MLP(Network):
@@ -288,25 +85,30 @@ class MLP(Network):
         return [*layers, Affine(inputs, outputs)]
 
 
-NETWORKS: dict[str, type[Network]] = {"mlp": MLP}
+class CNN(MLP):
+    """An MLP behind convolutions over images and rings."""
+
+    convolves = True
+
+
+NETWORKS: dict[str, type[Network]] = {"mlp": MLP, "cnn": CNN}
 """Kinds of networks by the name in a config. A kind of your own is a new entry."""
 
 
-def make_network(
-    inputs: int, outputs: int, config: Config, distances: Sequence[slice] = ()
-) -> Network:
+def make_network(arrays: Sequence[ArraySpec], outputs: int, config: Config) -> Network:
     """A network of the kind that a config names. Raises `InputError` for an unknown one."""
     if config.network not in NETWORKS:
         raise InputError(
             f"network: expected one of {', '.join(NETWORKS)}, got {config.network!r}; import the "
             "module that registers it first"
         )
-    return NETWORKS[config.network](inputs, outputs, config, distances)
+    return NETWORKS[config.network](arrays, outputs, config)
 
 
-def orthogonal(rng: Generator, shape: tuple[int, ...], gain: float) -> NDArray[np.float64]:
-    """Rows, or columns if they are fewer, that are orthogonal and of the length `gain`."""
-    rows, columns = shape
-    q, r = np.linalg.qr(rng.standard_normal((max(shape), min(shape))))
-    q *= np.where(np.diag(r) < 0, -1.0, 1.0)  # else the draw would not be uniform
-    return gain * (q if rows >= columns else q.T)
+def distances_in(arrays: Sequence[ArraySpec]) -> list[slice]:
+    """Where arrays, one after the other, have distances along rays: two axes, m, from 0 on."""
+    found = []
+    for array, place in zip(arrays, slices([array.size for array in arrays]), strict=True):
+        if array.unit == "m" and len(array.shape) == 2 and array.low == 0.0:
+            found.append(place)
+    return found

@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 
-from .networks import ByName, Floats, Weights
+from .layers import ByName, Floats, Weights
 
 
 class Adam:

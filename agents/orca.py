@@ -12,7 +12,7 @@ import numpy as np
 from ..envs.spec import EnvSpec
 from ..models.errors import InputError
 from .geometric import level_action
-from .networks import Floats
+from .layers import Floats
 from .policies import Observation, flat
 
 HORIZON = 3.0  # Time ahead for which nothing may touch, s

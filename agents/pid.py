@@ -7,7 +7,7 @@ import numpy as np
 
 from ..envs.spec import EnvSpec
 from ..models.errors import InputError
-from .networks import Floats
+from .layers import Floats
 from .policies import Observation
 
 ENV_ID = "rotorgram/Elevation-v0"

@@ -9,7 +9,8 @@ from ..envs.spec import ArraySpec, Discrete, EnvSpec
 from ..models.errors import InputError
 from .config import Config
 from .heads import Categorical, Gaussian, Head
-from .networks import Floats, Module, Parts, Tanh, Weights, make_network
+from .layers import Floats, Module, Parts, Tanh, Weights
+from .networks import make_network
 
 Array = np.ndarray
 Observation = Array | Mapping[str, Array]
@@ -42,20 +43,6 @@ def flat(observations: Observation, spec: EnvSpec, *lead: int) -> Array:
 def flat_size(spec: EnvSpec) -> int:
     """Length n of a flat observation."""
     return sum(array.size for array in spec.observation)
-
-
-def distances_in(spec: EnvSpec, copies: int = 1) -> list[slice]:
-    """Where flat observations, some of them side by side, have distances along rays: arrays of two
-    axes, m, from 0 on.
-    """
-    places = []
-    first = 0
-    for array in copies * spec.observation:
-        last = first + array.size
-        if array.unit == "m" and len(array.shape) == 2 and array.low == 0.0:
-            places.append(slice(first, last))
-        first = last
-    return places
 
 
 class ActionMap:
@@ -113,6 +100,7 @@ class NetworkPolicy(Module):
 
     Attributes:
         network: From observations to the mean of the action, or to the logits of the choices.
+        memory: What the network remembers of the episode, if it has a memory.
         head: Distribution of the actions.
         actions: Map from outputs to actions of the env.
         shapes: Of its weights: those of the network and of the head.
@@ -122,7 +110,8 @@ class NetworkPolicy(Module):
         self.spec = spec
         self.actions = ActionMap(spec.action)
         outputs = self.actions.outputs
-        self.network = make_network(flat_size(spec), outputs, config, distances_in(spec))
+        self.network = make_network(spec.observation, outputs, config)
+        self.memory = self.network.memory
         self.head: Head = Head() if config.squashed else Gaussian(outputs)
         if self.actions.discrete:
             self.head = Categorical(outputs)
@@ -160,7 +149,9 @@ class NetworkPolicy(Module):
         self.head.initialise(log_std)
 
     def reset(self) -> None:
-        """Nothing of an episode is kept."""
+        """Forget the episode, if the network has a memory."""
+        if self.memory:
+            self.memory.state[...] = 0.0
 
     def act(self, observation: Observation) -> Action:
         """The most likely action, inside the bounds of the env."""
@@ -172,7 +163,7 @@ class NetworkPolicy(Module):
     def outputs(self, observations: Floats) -> Floats:
         """Outputs of the network, shape (B, k), for flat observations, shape (B, n).
 
-        They hold until the next call.
+        They hold until the next call. A memory takes them as the next of B episodes.
         """
         return self.network.forward(observations.T).T
 

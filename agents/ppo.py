@@ -7,7 +7,7 @@ import numpy as np
 from ..models.fields import Limits, PositiveInt, immutable
 from .a2c import A2C, A2CConfig
 from .config import Positive
-from .networks import Floats, views
+from .layers import Floats, views
 from .optimizers import clip_norm
 from .rollouts import Rollout
 
@@ -64,16 +64,23 @@ class PPO(A2C):
     def update(self, rollout: Rollout) -> None:
         """Learn from a rollout: by `epochs` times `minibatches` steps of Adam."""
         config = self.config
+        sequences = self.sequences(rollout)
         columns = self.columns(rollout)
         scales = self.scales
-        count = len(rollout)
-        minibatches = min(config.minibatches, count)
+        axis = 0
+        choices = np.arange(len(rollout))
+        if sequences:  # whole drones
+            axis = 1
+            choices = np.flatnonzero(rollout.kept.any(axis=0))
+        minibatches = min(config.minibatches, len(choices))
         self._changes: list[Floats] = []
         terms: list[tuple[float, ...]] = []
         for _ in range(config.epochs):
-            order = self._rng.permutation(count)
-            for rows in np.array_split(order, minibatches):
-                terms.append(self.minibatch(*(column.take(rows, axis=0) for column in columns)))
+            order = self._rng.permutation(choices)
+            for chosen in np.array_split(order, minibatches):
+                some = [column.take(chosen, axis=axis) for column in columns]
+                part = sequences.take(chosen) if sequences else None
+                terms.append(self.minibatch(*some, sequences=part))
                 clip_norm(self.weights.slopes, config.max_grad_norm)
                 self.optimizer.step(self.rate, scales)
         means = np.mean(terms, axis=0).tolist()
@@ -81,15 +88,20 @@ class PPO(A2C):
         changes = np.concatenate(self._changes)
         growth = np.expm1(changes)
         self.terms["clip_fraction"] = np.mean(np.abs(growth) > config.clip)
-        distances = (growth - changes)[-count:]  # of KL in the last epoch, as SB3 estimates it
-        self.terms["approx_kl"] = distances.mean()
+        distances = growth - changes  # of KL, as SB3 estimates it
+        self.terms["approx_kl"] = distances[-len(rollout) :].mean()
 
     def columns(self, rollout: Rollout) -> list[Floats]:
         """As of A2C, and log-probabilities by the policy that flew."""
+        own = self.sequences(rollout, 0)
         columns = super().columns(rollout)
-        observations = rollout.rows(rollout.observations)
-        outputs = self._actor.outputs(observations)
-        return [*columns, self._actor.head.score(outputs.T, columns[1].T)[0]]
+        actions = columns[1]
+        *lead, size = actions.shape
+        observations = rollout.observations if own else rollout.rows(rollout.observations)
+        rows = observations.reshape(-1, observations.shape[-1])
+        outputs = self._actor.network.forward(rows.T, own)
+        before, _ = self._actor.head.score(outputs, actions.reshape(-1, size).T)
+        return [*columns, before.reshape(lead)]
 
     def objective(  # type: ignore[override]
         self, log_probability: Floats, advantage: Floats, before: Floats

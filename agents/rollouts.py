@@ -5,14 +5,14 @@ Time is the first axis, drones may be the second: arrays have the shape (T, ...)
 truncation and never over a termination; a recursion stops at either, and at the last row.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..models.errors import InputError
 from .episodes import EpisodeRecorder, Mask
-from .networks import Floats
+from .layers import Floats
 from .policies import Array, NetworkPolicy
 
 Numbers = NDArray[np.float64]
@@ -44,6 +44,8 @@ class Rollout:
     """Shape (T, N), as the following."""
     truncated: Mask
     kept: Mask
+    state: Floats = field(default_factory=lambda: np.zeros((0, 0), np.float32))
+    """Of the policy's memory before the first row, shape (H, N)."""
 
     def __len__(self) -> int:
         return int(self.kept.sum())
@@ -52,6 +54,16 @@ class Rollout:
     def ends(self) -> Mask:
         """After which rows another episode begins, or may: bool, shape (T, N)."""
         return np.asarray(self.terminated | self.truncated | ~self.kept)
+
+    @property
+    def begins(self) -> Mask:
+        """Before which rows an episode begins, of which a memory knows nothing: shape (T, N).
+
+        The first row has the state that the rollout has kept.
+        """
+        begins = np.zeros_like(self.kept)
+        begins[1:] = self.ends[:-1]
+        return begins
 
     def rows(self, array: Array) -> Array:
         """The kept rows of an array of shape (T, N, ...): one for each transition."""
@@ -127,6 +139,8 @@ class Collector:
         log.start()
         stop = None if most_steps is None else log.env_steps + most_steps
         block = length or max(256 // count, 1)
+        memory = self.policy.memory
+        state = memory.state.copy() if memory else np.zeros((0, count), np.float32)
         rows: list[tuple[Array, ...]] = []
         observations = log.observations
         waiting = int(np.count_nonzero(log.done))
@@ -146,6 +160,8 @@ class Collector:
             after = log.observations
             ends = (env.terminated, env.truncated, flying, env.lost)
             rows.append((observations, actions, env.rewards, after, *ends))
+            if memory:
+                memory.forget(env.terminated | env.truncated | env.lost | ~flying)
             observations = after
             waiting = int(np.count_nonzero(log.done))  # of few drones faster than `any`
             if waiting == count:
@@ -157,7 +173,8 @@ class Collector:
         if waiting and (stop is None or waiting == count):
             log.begin(log.done)
         *columns, lost = (np.array(column) for column in zip(*rows, strict=True))
-        return Rollout(*columns), lost, waiting == count
+        rollout = replace(Rollout(*columns), state=state)
+        return rollout, lost, waiting == count
 
 
 def discounted_sums(values: Array, factors: Array) -> Numbers:

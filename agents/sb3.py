@@ -11,9 +11,10 @@ from ..models.errors import InputError, require
 from .a2c import A2C, A2CConfig
 from .config import Config, SACConfig
 from .episodes import EpisodeRecorder
+from .layers import ByName, Floats
 from .learner import OnUpdate, seeds_of
-from .networks import ByName, Floats
-from .policies import NetworkPolicy, distances_in
+from .networks import distances_in
+from .policies import NetworkPolicy
 from .ppo import PPO, PPOConfig
 from .rollouts import Diverged
 
@@ -156,7 +157,8 @@ class SB3Agent:
     def __init__(self, log: EpisodeRecorder, config: A2CConfig | SACConfig, seed: int) -> None:
         if config.network != "mlp":
             raise InputError(f"network: expected mlp with SB3, got {config.network!r}")
-        if distances_in(log.spec):
+        config.check_forgetful("SB3")
+        if distances_in(log.spec.observation):
             raise InputError(
                 "sb3: expected observations without distances of rays, which our own agents "
                 "take as nearness and SB3's do not"

@@ -7,8 +7,8 @@ import numpy as np
 from ..models.errors import InputError
 from ..models.fields import PositiveInt, immutable
 from .config import Config
+from .layers import Floats
 from .learner import Learner
-from .networks import Floats
 from .rollouts import Collector, Rollout, rewards_to_go, step_of_episode
 
 
@@ -25,6 +25,7 @@ class VPGConfig(Config):
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        self.check_forgetful("vpg")
         if self.baseline == "time" and self.episodes_per_update == 1:
             raise InputError(
                 "episodes_per_update: expected 2 or more with baseline 'time', where a single "

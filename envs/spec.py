@@ -32,6 +32,11 @@ BODY = "body"
 BODY_TO_WORLD = "body to world"
 """Frame of a quaternion w, x, y, z."""
 
+IMAGE = ("row", "column")
+"""Axes of an image, from its upper left corner on."""
+RINGS = ("ring", "azimuth")
+"""Axes of a lidar. Azimuths close a circle: the first follows the last."""
+
 Values = dict[str, Any]
 """Values by name, as JSON has them."""
 
@@ -96,7 +101,7 @@ class _Part:
 class ArraySpec(_Part):
     """An array of one drone. Bounds of the same value are kept as one number."""
 
-    _optional = ("low", "high", "unit", "frame", "components", "categories")
+    _optional = ("low", "high", "unit", "frame", "axes", "components", "categories")
 
     name: Name
     shape: tuple[int, ...]
@@ -108,6 +113,8 @@ class ArraySpec(_Part):
     """One for all elements, or one for each."""
     frame: Word = ""
     """Frame of reference; empty where there is none."""
+    axes: Words = ()
+    """A name for each axis, or none: `IMAGE` and `RINGS` have neighbours."""
     components: Words = ()
     """A name for each element, or none."""
     categories: Words = ()
@@ -132,6 +139,8 @@ class ArraySpec(_Part):
         one_unit = isinstance(self.unit, str)
         units = (self.unit,) if one_unit else self.unit
         check(f"{name}: unit", _WORDS, units, SpecError)
+        right = not self.axes or len(self.axes) == len(shape)
+        _expect(right, name, f"{len(shape)} names of axes", self.axes)
         _expect(one_unit or len(units) == self.size, name, f"{self.size} units", len(units))
         _check_components(name, self.components, self.size)
 

@@ -54,6 +54,7 @@ def spec_of(config: EnvConfig, task: Task) -> EnvSpec:
             high=sensor.errors.reach,
             unit="m",
             frame=sensor.frame,
+            axes=sensor.axes,
         )
         observation.append(array)
     return EnvSpec(

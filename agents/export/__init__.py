@@ -2,17 +2,18 @@
 
 The file has the whole of `NetworkPolicy.act`: layers, activation, squashing, mapping to the env's
 action, clipping to its bounds; or the choice of the largest output. The action is the deterministic
-one. Every number is float32.
+one. Every number is float32. What a policy remembers of an episode goes in and comes out.
 """
 
 import json
+from collections.abc import Iterable
 from importlib import import_module
 
 import numpy as np
 
 from ...models.errors import InputError, require
 from ..checkpoints import Checkpoint
-from ..networks import Affine, Nearness, Relu, Tanh
+from ..layers import Layer
 from ..policies import NetworkPolicy, flat_size
 
 FORMAT = 1
@@ -39,12 +40,22 @@ def export(checkpoint: Checkpoint, target: str) -> bytes:
         require("onnx", "export", "--to onnx")
     module = import_module(f"{__name__}.{target}")
     policy = checkpoint.policy()
-    for layer in policy.network.layers:
-        if not isinstance(layer, Affine | Nearness | Relu | Tanh):
-            expected = "layers of affine, nearness, relu and tanh"
-            raise InputError(f"export: expected {expected}, got {type(layer).__name__}")
     _check_finite(policy)
     return bytes(module.write(policy, metadata(checkpoint)))
+
+
+def write_layers(writer: object, layers: Iterable[Layer]) -> None:
+    """Call the writer's method of each layer's name, as `affine`.
+
+    Raises `InputError` where there is none.
+    """
+    for layer in layers:
+        name = type(layer).__name__
+        write = getattr(writer, name.lower(), None)
+        if write is None:
+            expected = "affine layers, convolutions, a GRU, nearness, relu and tanh"
+            raise InputError(f"export: expected {expected}, got {name}")
+        write(layer)
 
 
 def _check_finite(policy: NetworkPolicy) -> None:

@@ -16,8 +16,11 @@ from ...envs.spec import (
     component_names,
     component_units,
 )
-from ..networks import Affine, Floats, Nearness, Relu, Tanh
+from ..convolutions import Convolution, Encoder
+from ..layers import Affine, Floats, Layer, Nearness
+from ..memory import GRU
 from ..policies import NetworkPolicy, flat_size
+from . import write_layers
 
 _LARGEST = float(np.finfo(np.float32).max)
 _PAIRS = re.compile(r"(?<=\*)(?=/)|(?<=/)(?=\*)|(?<=\?)(?=\?)")
@@ -47,9 +50,48 @@ static inline float rotorgram_tanh(float x)
     return t;
 }"""
 
+_CONVOLUTION = """
+/* Sums over windows, a column of numbers of inputs each: filter by filter, as a row of weights. */
+static inline void rotorgram_convolution(const float *weight, const int *places, int rows,
+                                         int windows, const float *in, float *out, int filters)
+{
+    for (int i = 0; i < filters; i++, weight += 1 + rows)
+        for (int k = 0; k < windows; k++) {
+            float sum = weight[0];
+            for (int j = 0; j < rows; j++)
+                sum += weight[1 + j] * in[places[j * windows + k]];
+            *out++ = sum;
+        }
+}"""
+_GRU = """
+/* Gates from sums over inputs and state: update, reset, candidate. Moves the state. */
+static inline void rotorgram_gru(const float *sums, const float *recalled, float *state, int units)
+{
+    for (int i = 0; i < units; i++) {
+        float update = 0.5f + 0.5f * rotorgram_tanh(0.5f * (sums[i] + recalled[i]));
+        int j = units + i, k = j + units;
+        float reset = 0.5f + 0.5f * rotorgram_tanh(0.5f * (sums[j] + recalled[j]));
+        float candidate = rotorgram_tanh(sums[k] + reset * recalled[k]);
+        state[i] = candidate + update * (state[i] - candidate);
+    }
+}"""
+_STATE = """
+/* What the policy remembers of an episode; initialise it when one begins. */
+typedef struct {
+    float memory[ROTORGRAM_STATE];
+} rotorgram_policy_state;
+
+static inline void rotorgram_policy_init(rotorgram_policy_state *state)
+{
+    for (int i = 0; i < ROTORGRAM_STATE; i++)
+        state->memory[i] = 0.0f;
+}"""
+
 
 def write(policy: NetworkPolicy, facts: Mapping[str, str]) -> bytes:
     """A header with `void rotorgram_policy(const float observation[n], float action[k])`.
+
+    With a memory a pointer to `rotorgram_policy_state` is its first argument.
 
     A discrete action is the number of the choice, in one element. An infinite bound is the largest
     float32: C has no infinity without a library.
@@ -62,18 +104,21 @@ def write(policy: NetworkPolicy, facts: Mapping[str, str]) -> bytes:
         f"#define ROTORGRAM_OBSERVATIONS {facts['inputs']}",
         f"#define ROTORGRAM_ACTIONS {policy.actions.size}",
         f"#define ROTORGRAM_TELEMETRY {sum(map(_text_size, policy.spec.telemetry))}",
-        f"#define ROTORGRAM_CONTROL_PERIOD {facts['control_period']}\n",
+        f"#define ROTORGRAM_CONTROL_PERIOD {facts['control_period']}",
     ]
+    arguments = f"const float observation[{facts['inputs']}], float action[{policy.actions.size}]"
+    if policy.memory:
+        parts.append(f"#define ROTORGRAM_STATE {policy.memory.units}\n{_STATE}")
+        arguments = f"rotorgram_policy_state *state, {arguments}"
+    parts.append("")
     for name, values in program.tables.items():
         numbers = _table(values)
-        parts.append(f"static const float rotorgram_{name}[{values.size}] = {{\n{numbers}\n}};")
-    parts.append(_LAYER)
-    if any(isinstance(layer, Tanh) for layer in policy.network.layers):
-        parts.append(_TANH)
+        kind = "int" if values.dtype.kind == "i" else "float"
+        parts.append(f"static const {kind} rotorgram_{name}[{values.size}] = {{\n{numbers}\n}};")
+    parts += program.functions
     parts += [
         "\n/* The action for an observation. */",
-        f"static inline void rotorgram_policy(const float observation[{facts['inputs']}],",
-        f"                                    float action[{policy.actions.size}])",
+        f"static inline void rotorgram_policy({arguments})",
         "{",
         *(f"    {line}" for line in program.lines),
         "}\n",
@@ -87,29 +132,16 @@ class _Program:
 
     Attributes:
         at: Name of the array with the numbers so far, `size` of them.
+        functions: Texts of those that the statements call.
     """
 
     def __init__(self, policy: NetworkPolicy) -> None:
-        self.tables: dict[str, Floats] = {}
+        self.tables: dict[str, np.ndarray] = {}
+        self.functions = [_LAYER]
         self.lines: list[str] = []
         self.at = "observation"
         self.size = flat_size(policy.spec)
-        for layer in policy.network.layers:
-            if isinstance(layer, Affine):
-                units = len(layer.weight)
-                number = len(self.tables)
-                weight = self._table(f"weight_{number}", layer.weight)
-                outputs = f"x{number}"
-                arguments = f"{weight}, {self.at}, {self.size}, {outputs}, {units}"
-                self.lines += [f"float {outputs}[{units}];", f"rotorgram_layer({arguments});"]
-                self.at = outputs
-                self.size = units
-            elif isinstance(layer, Nearness):
-                self._near(layer)
-            elif isinstance(layer, Relu):
-                self._each(f"{self.at}[i] = {self.at}[i] < 0.0f ? 0.0f : {self.at}[i];")
-            else:
-                self._each(f"{self.at}[i] = rotorgram_tanh({self.at}[i]);")
+        write_layers(self, policy.network.layers)
         if policy.actions.discrete:
             self.lines.append("action[0] = 0.0f;")
             largest = f"{self.at}[(int)action[0]]"
@@ -117,7 +149,74 @@ class _Program:
         else:
             self._act(policy)
 
-    def _table(self, name: str, values: Floats) -> str:
+    def affine(self, layer: Affine) -> None:
+        self._sum(layer.weight, self.at)
+
+    def relu(self, layer: Layer) -> None:
+        self._each(f"{self.at}[i] = {self.at}[i] < 0.0f ? 0.0f : {self.at}[i];")
+
+    def tanh(self, layer: Layer) -> None:
+        self._needs(_TANH)
+        self._each(f"{self.at}[i] = rotorgram_tanh({self.at}[i]);")
+
+    def _sum(self, weight: Floats, inputs: str) -> str:
+        """An affine layer over an array; the name of its outputs."""
+        units, size = weight.shape
+        outputs = self._array(units)
+        table = self._table(weight)
+        arguments = f"{table}, {inputs}, {size - 1}, {outputs}, {units}"
+        self.lines.append(f"rotorgram_layer({arguments});")
+        return outputs
+
+    def convolution(self, layer: Convolution) -> None:
+        self._needs(_CONVOLUTION)
+        filters = len(layer.weight)
+        rows, windows = layer.places[1:].shape
+        tables = f"{self._table(layer.weight)}, {self._table(layer.places[1:] - 1)}"
+        inputs = f"{rows}, {windows}, {self.at}"
+        outputs = self._array(filters * windows)
+        self.lines.append(f"rotorgram_convolution({tables}, {inputs}, {outputs}, {filters});")
+
+    def encoder(self, layer: Encoder) -> None:
+        """Each array by its own layers, joined."""
+        inputs = self.at
+        size = self.size
+        joined = self._array(layer.outputs)
+        for chain, taken, given in zip(layer.chains, layer.taken, layer.given, strict=True):
+            self.at = inputs
+            self.size = size
+            first = 0 if chain.layers else taken.start
+            write_layers(self, chain.layers)
+            self.size = given.stop - given.start
+            self._each(f"{joined}[{given.start} + i] = {self.at}[{first} + i];")
+        self.at = joined
+        self.size = layer.outputs
+
+    def gru(self, layer: GRU) -> None:
+        self._needs(_TANH)
+        self._needs(_GRU)
+        sums = self._sum(layer.weight, self.at)
+        without_bias = np.zeros_like(layer.recurrent[:, :1])
+        recurrent = np.concatenate((without_bias, layer.recurrent), axis=1)
+        recalled = self._sum(recurrent, "state->memory")
+        self.lines.append(f"rotorgram_gru({sums}, {recalled}, state->memory, {layer.units});")
+        outputs = self._array(layer.units)
+        self._each(f"{outputs}[i] = state->memory[i];")
+
+    def _array(self, size: int) -> str:
+        """The name of a new array of numbers, which is that of the numbers so far."""
+        self.at = f"x{len(self.lines)}"
+        self.size = size
+        self.lines.append(f"float {self.at}[{size}];")
+        return self.at
+
+    def _needs(self, function: str) -> None:
+        if function not in self.functions:
+            self.functions.append(function)
+
+    def _table(self, values: np.ndarray, name: str = "") -> str:
+        """The name of a new table."""
+        name = name or f"weight_{len(self.tables)}"
         self.tables[name] = values
         return f"rotorgram_{name}"
 
@@ -125,22 +224,23 @@ class _Program:
         """A loop over the numbers so far."""
         self.lines += [f"for (int i = 0; i < {self.size}; i++)", f"    {statement}"]
 
-    def _near(self, layer: Nearness) -> None:
+    def nearness(self, layer: Nearness) -> None:
         """Distances as nearness, in a copy of the observation."""
-        self.lines.append(f"float seen[{self.size}];")
-        self._each("seen[i] = observation[i];")
-        self.at = "seen"
+        seen = self._array(self.size)
+        self._each(f"{seen}[i] = observation[i];")
         for place in layer.places:
             self.lines += [
-                f"for (int i = {place.start}; i < {place.stop}; i++)",
-                "    seen[i] = 2.0f / (1.0f + (seen[i] < 0.0f ? 0.0f : 0.5f * seen[i])) - 0.5f;",
+                f"for (int i = {place.start}; i < {place.stop}; i++) {{",
+                f"    float half = {seen}[i] < 0.0f ? 0.0f : 0.5f * {seen}[i];",
+                f"    {seen}[i] = 2.0f / (1.0f + half) - 0.5f;",
+                "}",
             ]
 
     def _act(self, policy: NetworkPolicy) -> None:
         """Map the outputs to the range of the action, and clip them to its bounds."""
         actions = policy.actions
         names = ("middle", "half", "low", "high")
-        tables = (self._table(f"action_{name}", getattr(actions, name)) for name in names)
+        tables = (self._table(getattr(actions, name), f"action_{name}") for name in names)
         middle, half, low, high = tables
         self.lines += [
             f"for (int i = 0; i < {self.size}; i++) {{",
@@ -167,13 +267,15 @@ def _number(value: float) -> str:
     return digits + ("f" if re.search("[.e]", digits) else ".0f")
 
 
-def _table(values: Floats) -> str:
+def _table(values: np.ndarray) -> str:
     """Numbers as lines of an initializer, six in a line.
 
     Infinite ones are the largest float32: C has no infinity without a library.
     """
-    finite = values.clip(-_LARGEST, _LARGEST)
-    words = [_number(value) for value in finite.ravel().tolist()]
+    words = [str(value) for value in values.ravel().tolist()]
+    if values.dtype.kind == "f":
+        finite = values.clip(-_LARGEST, _LARGEST)
+        words = [_number(value) for value in finite.ravel().tolist()]
     lines = [", ".join(words[first : first + 6]) for first in range(0, len(words), 6)]
     return ",\n".join(f"    {line}" for line in lines)
 

@@ -38,13 +38,28 @@ enum {
     TELEMETRY = ROTORGRAM_TELEMETRY
 };
 
+#ifdef ROTORGRAM_STATE
+static rotorgram_policy_state state; /* what the policy remembers of the episode */
+#endif
+
+static void begin(void)
+{
+#ifdef ROTORGRAM_STATE
+    rotorgram_policy_init(&state);
+#endif
+}
+
 /* Text has the digits of a double; observations and actions are floats on both sides. */
 static void act(const double *values, double *action)
 {
     float observation[OBSERVATIONS], chosen[ACTIONS];
     for (int i = 0; i < OBSERVATIONS; i++)
         observation[i] = (float)values[i];
+#ifdef ROTORGRAM_STATE
+    rotorgram_policy(&state, observation, chosen);
+#else
     rotorgram_policy(observation, chosen);
+#endif
     for (int i = 0; i < ACTIONS; i++)
         action[i] = chosen[i];
 }
@@ -53,6 +68,10 @@ static void act(const double *values, double *action)
  * angles, three velocities and three body rates; F1 to F4, the goal X, Y, Z, and E as the metric. */
 #define LAST "last |E| %.6f m"
 enum { OBSERVATIONS = 3, ACTIONS = 1, TELEMETRY = 20 };
+
+static void begin(void)
+{
+}
 
 static void act(const double *values, double *action)
 {
@@ -242,6 +261,7 @@ static int fly(uint64_t episodes, uint64_t seed, double patience)
             snprintf(answer, sizeof answer, "%" PRIu64 ",reset,%" PRIu64, m.sequence, seed + episode);
             steps = 0;
             total = 0;
+            begin();
         } else {
             double action[ACTIONS];
             int end = snprintf(answer, sizeof answer, "%" PRIu64, m.sequence);

@@ -84,6 +84,7 @@ class RangeSensor(Instrument):
     Attributes:
         name: `depth`, `lidar` or `tof`.
         rays: In the body frame.
+        axes: Names of the axes of rows and columns; none of rays in single directions.
         errors: Of its readings.
     """
 
@@ -121,6 +122,8 @@ class RangeSensor(Instrument):
                 f"got {self.errors.reach:g}"
             )
         self.shape = sensor.directions.shape[:2]
+        grid = ("ring", "azimuth") if kind == "lidar" else ("row", "column")
+        self.axes = () if "directions" in model else grid
         what = "along the axis of the sensor" if self._is_flat else "along each ray"
         self.frame = f"body, {what}"
 

@@ -5,15 +5,18 @@ from typing import Any
 
 import numpy as np
 from rotorgram.agents.config import Config, SACConfig
-from rotorgram.agents.networks import MLP, Network, Weights, named
+from rotorgram.agents.layers import Weights, named
+from rotorgram.agents.networks import MLP, Network
 from rotorgram.agents.policies import NetworkPolicy
-from rotorgram.envs.spec import EnvSpec
+from rotorgram.envs.spec import ArraySpec, EnvSpec
 
 
-def config_of(hidden: tuple[int, ...], activation: str, *, squash: bool = False) -> Config:
+def config_of(
+    hidden: tuple[int, ...], activation: str, *, squash: bool = False, **settings: Any
+) -> Config:
     """With any number of hidden layers, none too."""
     kind = SACConfig if squash else Config
-    config = kind(activation=activation)  # type: ignore[arg-type]
+    config = kind(activation=activation, **settings)
     object.__setattr__(config, "hidden", hidden)
     return config
 
@@ -44,7 +47,8 @@ def mlp_of(
 ) -> tuple[MLP, Weights]:
     """An MLP of so many inputs, units and outputs."""
     inputs, *hidden, outputs = sizes
-    network = MLP(inputs, outputs, config_of(tuple(hidden), activation))
+    seen = [ArraySpec(name="seen", shape=(inputs,))]
+    network = MLP(seen, outputs, config_of(tuple(hidden), activation))
     return network, bound(network, values)
 
 
@@ -67,7 +71,7 @@ def random_policy(
     hidden: tuple[int, ...] = (16,),
     activation: str = "relu",
     size: float = 1.0,
-    **kinds: bool,
+    **kinds: Any,
 ) -> NetworkPolicy:
     """A policy of random weights of such a size."""
     policy = NetworkPolicy(spec, config_of(hidden, activation, **kinds))

@@ -40,7 +40,9 @@ def agent_of(algorithm: str, *, discrete: bool) -> Any:
     action = Discrete(choices=3) if discrete else ArraySpec(name="action", shape=(3,))
     spec = replace(spec_of(action), agents=("one", "two"))
     row = ALGORITHMS[algorithm]
-    return row.agent(SimpleNamespace(spec=spec), row.config(**SETTINGS[algorithm]), 3)
+    return row.agent(
+        SimpleNamespace(spec=spec, num_envs=DRONES), row.config(**SETTINGS[algorithm]), 3
+    )
 
 
 def rollout(rng: np.random.Generator, *, discrete: bool) -> Rollout:
@@ -133,7 +135,7 @@ def test_a_hundred_updates_are_those_of_torch(algorithm: str, discrete: bool) ->
     if algorithm != "vpg":
         minibatch = agent.minibatch
 
-        def both(*columns: np.ndarray) -> tuple[float, ...]:
+        def both(*columns: np.ndarray, **_: None) -> tuple[float, ...]:
             reference.minibatch(*columns)
             terms: tuple[float, ...] = minibatch(*columns)
             return terms

@@ -2,6 +2,7 @@
 
 import json
 import re
+import shutil
 import subprocess
 from collections.abc import Callable
 from dataclasses import replace
@@ -21,8 +22,9 @@ from rotorgram.agents.episodes import Position
 from rotorgram.agents.export import TARGETS, export, metadata
 from rotorgram.agents.export import c as c_target
 from rotorgram.agents.export import onnx as onnx_target
-from rotorgram.agents.policies import NetworkPolicy, flat_size
+from rotorgram.agents.policies import NetworkPolicy, flat, flat_size
 from rotorgram.cli import main
+from rotorgram.envs import LocalVectorEnv
 from rotorgram.envs.config import EnvConfig
 from rotorgram.envs.registry import env_spec
 from rotorgram.envs.spec import ArraySpec, Discrete, EnvSpec
@@ -43,7 +45,7 @@ CHECKED = ["-Wconversion", "-fsanitize=address,undefined", "-fno-sanitize-recove
 
 
 def policy_of(
-    spec: EnvSpec, hidden: tuple[int, ...] = (16,), activation: str = "relu", **kinds: bool
+    spec: EnvSpec, hidden: tuple[int, ...] = (16,), activation: str = "relu", **kinds: Any
 ) -> NetworkPolicy:
     """A policy with random weights, whose outputs fill the range of actions."""
     policy = random_policy(spec, hidden, activation, 0.3, **kinds)
@@ -70,6 +72,20 @@ def elevation() -> EnvSpec:
 def hover(**keywords: str) -> EnvSpec:
     config = EnvConfig.from_keywords("rotorgram/Hover-v0", **keywords)
     return env_spec(config)
+
+
+def sighted_config(**keywords: Any) -> EnvConfig:
+    """Plain numbers, a depth camera, a lidar and single rays."""
+    sensors = {
+        "depth": {"rows": 5, "columns": 12},
+        "lidar": {"model": "mid360", "rows": 3, "columns": 14},
+        "tof": {"model": "multiranger"},
+    }
+    return EnvConfig.from_keywords("rotorgram/Forest-v0", sensors=sensors, **keywords)
+
+
+def sighted() -> EnvSpec:
+    return env_spec(sighted_config())
 
 
 def told_of(spec: EnvSpec) -> dict[str, str]:
@@ -161,6 +177,8 @@ CASES: dict[str, Callable[[], NetworkPolicy]] = {
     "half bounded": lambda: policy_of(HALF_BOUNDED, (8,)),
     "choice": lambda: policy_of(CHOICE, (16, 8), "tanh"),
     "by sight": lambda: policy_of(env_spec(EnvConfig(env_id="rotorgram/Forest-v0")), (16,), "tanh"),
+    "by convolutions": lambda: policy_of(sighted(), (16,), "tanh", network="cnn"),
+    "of relu": lambda: policy_of(sighted(), (16,), network="cnn"),
     "linear": lambda: policy_of(spec_of(), ()),
 }
 RUNNERS = {"onnxruntime": by_onnxruntime, "gcc": by_gcc, "g++": by_gpp}
@@ -183,6 +201,91 @@ def test_numbers_are_those_of_the_policy(case: str, runner: str, tmp_path: Path)
     different = np.unique(expected, axis=0)
     least = 3 if case == "choice" else ROWS // 20
     assert len(different) > least
+
+
+C_EPISODES = """
+#include <stdio.h>
+#include "rotorgram_policy.h"
+
+int main(void)
+{
+    rotorgram_policy_state state;
+    float row[1 + ROTORGRAM_OBSERVATIONS], action[ROTORGRAM_ACTIONS];
+    while (fread(row, sizeof row, 1, stdin) == 1) {
+        if (row[0] > 0)
+            rotorgram_policy_init(&state);
+        rotorgram_policy(&state, row + 1, action);
+        fwrite(action, sizeof action, 1, stdout);
+    }
+    return 0;
+}
+"""
+
+
+def flown_by_memory(network: str) -> tuple[NetworkPolicy, list[np.ndarray], list[np.ndarray]]:
+    """Observations and actions of two whole episodes that a policy with a GRU flies."""
+    config = sighted_config(backend="rigid", episode_length=150)
+    policy = policy_of(env_spec(config), (16,), "tanh", network=network, memory=12)
+    observations: list[np.ndarray] = []
+    actions: list[np.ndarray] = []
+    env = LocalVectorEnv(config, 1, autoreset_mode="Disabled")
+    for seed in (1, 2):
+        policy.reset()
+        seen, _ = env.reset(seed=seed)
+        rows = []
+        done = False
+        own = []
+        while not done:
+            rows.append(flat(seen, env.env_spec, 1)[0])
+            own.append(np.ravel(policy.act(seen)).copy())
+            seen, _, terminated, truncated, _ = env.step(own[-1][None])
+            done = bool(terminated[0] or truncated[0])
+        observations.append(np.array(rows))
+        actions.append(np.array(own))
+    env.close()
+    return policy, observations, actions
+
+
+def states_of_onnx(policy: NetworkPolicy, episodes: list[np.ndarray]) -> np.ndarray:
+    """Actions of all episodes, with the state carried from call to call."""
+    session = onnxruntime.InferenceSession(onnx_target.write(policy, told_of(policy.spec)))
+    found = []
+    for rows in episodes:
+        state = np.zeros((1, 12), np.float32)
+        for row in rows:
+            feed = {"observation": row[None], "state": state}
+            action, state = session.run(["action", "next_state"], feed)
+            found.append(action[0])
+    return np.array(found)
+
+
+def states_of_c(
+    policy: NetworkPolicy, episodes: list[np.ndarray], folder: Path, compiler: str
+) -> np.ndarray:
+    header = folder / "rotorgram_policy.h"
+    header.write_bytes(c_target.write(policy, told_of(policy.spec)))
+    (folder / "main.c").write_text(C_EPISODES)
+    flags = [*C_FLAGS, *CHECKED] if compiler == "gcc" else CPP_FLAGS
+    compiled(tool(compiler), *flags, "-o", folder / "main", folder / "main.c")
+    begins = [np.arange(len(rows)) == 0 for rows in episodes]
+    rows = np.column_stack((np.concatenate(begins), np.concatenate(episodes)))
+    return fed(rows.astype(np.float32), folder / "main")
+
+
+@pytest.mark.parametrize("network", ["mlp", "cnn"])
+def test_a_memory_flies_whole_episodes_as_the_policy_does(network: str, tmp_path: Path) -> None:
+    policy, observations, actions = flown_by_memory(network)
+    expected = np.concatenate(actions)
+    assert min(map(len, actions)) > 10
+    assert np.abs(actions[0][:5] - actions[1][:5]).max() > 1e-3
+    found = {
+        "onnx": states_of_onnx(policy, observations),
+        "gcc": states_of_c(policy, observations, tmp_path, "gcc"),
+        "g++": states_of_c(policy, observations, tmp_path, "g++"),
+    }
+    for name, theirs in found.items():
+        np.testing.assert_allclose(theirs, expected, rtol=0, atol=1e-5, err_msg=name)
+    onnx.checker.check_model(onnx.load_from_string(onnx_target.write(policy, {})), full_check=True)
 
 
 @pytest.mark.parametrize("runner", RUNNERS)
@@ -427,15 +530,31 @@ def flown_by_c(header: Path, seed: int) -> np.ndarray:
     return np.array(actions)
 
 
-def test_the_c_peer_flies_what_evaluate_flies(trained: Path, tmp_path: Path) -> None:
+def remembering(trained: Path) -> None:
+    """Give the checkpoint of a folder a GRU and random weights."""
+    path = trained / "checkpoint.safetensors"
+    kept = load(path)
+    config = {**kept.config, "memory": 8}
+    actor = policy_of(kept.spec, memory=8).weights.arrays
+    store(replace(kept, config=config, actor=actor).policy_alone(), path)
+
+
+@pytest.mark.parametrize("memory", [False, True], ids=["reflex", "memory"])
+def test_the_c_peer_flies_what_evaluate_flies(memory: bool, trained: Path, tmp_path: Path) -> None:
+    trained = Path(shutil.copytree(trained, tmp_path / "run"))
+    if memory:
+        remembering(trained)
     journal = tmp_path / "ours.mcap"
     assert main(["evaluate", str(trained), "--episodes", "2", "--record", str(journal)]) == 0
     sent = [item.message for item in Recording(journal) if isinstance(item.message, Command)]
     ours = np.array([m.actions[0] for m in sent if m.orders[0] == FLY], np.float64)
     header = exported(trained, "c", tmp_path)
     theirs = [flown_by_c(header, evaluation_seed(episode, "final")) for episode in range(2)]
-    assert [len(flight) for flight in theirs] == [250, 250]
-    assert np.ptp(ours) > 1.0
+    lengths = [len(flight) for flight in theirs]
+    assert memory or lengths == [250, 250]
+    assert sum(lengths) == len(ours)
+    assert min(lengths) > 20
+    assert np.ptp(ours) > 0.3
     np.testing.assert_allclose(np.concatenate(theirs), ours, rtol=0, atol=1e-5)
 
 

@@ -7,16 +7,8 @@ import pytest
 import torch
 from nets import bound, config_of, mlp_of, random_policy
 from rotorgram.agents.config import Config
-from rotorgram.agents.networks import (
-    MLP,
-    Affine,
-    Layer,
-    Network,
-    Relu,
-    Tanh,
-    Weights,
-    orthogonal,
-)
+from rotorgram.agents.layers import Affine, Layer, Relu, Tanh, Weights, orthogonal
+from rotorgram.agents.networks import MLP, Network
 from rotorgram.agents.optimizers import Adam, clip_norm
 from rotorgram.agents.policies import NetworkPolicy
 from rotorgram.agents.vpg import VPGConfig
@@ -166,7 +158,7 @@ class Squashed(Network):
 
 
 def test_activations_may_come_first_and_last() -> None:
-    network = Squashed(2, 3, VPGConfig())
+    network = Squashed([ArraySpec(name="seen", shape=(2,))], 3, VPGConfig())
     weights = bound(network)
     network.initialise(np.random.default_rng(0), 0.01)
     inputs = np.array([[0.5], [-2.0]], np.float32)
@@ -177,25 +169,26 @@ def test_activations_may_come_first_and_last() -> None:
 
 
 def test_distances_come_in_as_nearness() -> None:
-    network = MLP(6, 2, config_of((4,), "tanh"), [slice(1, 3), slice(5, 6)])
+    near = [ArraySpec(name=f"near {n}", shape=(1, n), low=0.0, unit="m") for n in (2, 1)]
+    plain = [ArraySpec(name=f"plain {n}", shape=(n,)) for n in (1, 2)]
+    arrays = [plain[0], near[0], plain[1], near[1]]
+    network = MLP(arrays, 2, config_of((4,), "tanh"))
     weights = bound(network)
     weights.values[:] = normal(weights.values.size)
     inputs = np.abs(normal(6, BATCH)) * 3.0
     tensor = torch.tensor(inputs.T, requires_grad=True)
-    near = 2 / (1 + tensor / 2) - 0.5
+    nearness = 2 / (1 + tensor / 2) - 0.5
     is_near = torch.tensor([False, True, True, False, False, True])
     arrays = tensors(weights)
-    outputs = torch_mlp(arrays, torch.where(is_near, near, tensor), "tanh")
+    outputs = torch_mlp(arrays, torch.where(is_near, nearness, tensor), "tanh")
     got = network.forward(inputs)
     np.testing.assert_allclose(got, outputs.detach().numpy().T, rtol=1e-5, atol=1e-6)
     slope = normal(2, BATCH)
     outputs.backward(torch.tensor(slope.T))
     network.backward(slope.copy())
     agree(weights, arrays)
-    back = slope.copy()
     network.forward(inputs)
-    for layer in reversed(network.layers):
-        back = layer.back(back)
+    back = network.back(slope.copy())
     theirs = tensor.grad
     assert theirs is not None
     np.testing.assert_allclose(back, theirs.numpy().T, rtol=1e-4, atol=1e-5)

@@ -33,7 +33,7 @@ def test_every_epoch_takes_every_transition_once() -> None:
     taken: list[np.ndarray] = []
     minibatch = agent.minibatch
 
-    def keep(*columns: np.ndarray) -> tuple[float, ...]:
+    def keep(*columns: np.ndarray, **_: None) -> tuple[float, ...]:
         taken.append(np.column_stack(columns))
         return minibatch(*columns)
 

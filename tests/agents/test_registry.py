@@ -17,7 +17,8 @@ from rotorgram.agents import (
     store,
 )
 from rotorgram.agents.a2c import A2C
-from rotorgram.agents.networks import NETWORKS, Affine, Layer, Network, Tanh
+from rotorgram.agents.layers import Affine, Layer, Tanh
+from rotorgram.agents.networks import NETWORKS, Network
 from rotorgram.agents.registry import ALGORITHMS, Algorithm
 from rotorgram.cli import main
 from rotorgram.envs import LocalVectorEnv, register

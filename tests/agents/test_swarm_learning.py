@@ -38,6 +38,8 @@ def run_of(algorithm: str) -> Run:
 class Climbers:
     """A policy of which every second drone, from the first on, climbs; the others hover."""
 
+    memory = None
+
     def __init__(self) -> None:
         self.head = self
 
