@@ -11,7 +11,7 @@ class Evaluate(AgentFlags, BackendFlags):
     """Measure a trained policy or a controller over episodes without exploration."""
 
     policy: Positional[Annotated[str, arg(metavar="POLICY")]]
-    """Checkpoint, folder of a training, pid, geometric or orca."""
+    """Checkpoint, folder of a training, pid, geometric, orca or vfh."""
     episodes: Count = 20
     """Episodes to fly, from seeds that no training uses."""
 
@@ -19,6 +19,7 @@ class Evaluate(AgentFlags, BackendFlags):
         """Fly and print the means."""
         import pandas as pd
 
+        from ..flights.surroundings import Passage
         from ..flights.trajectories import fly_episodes
         from ..training.metrics import Headline, measure_episode
         from ._env import fitted, in_unseen, load_checkpoint, policy_for, remote_env
@@ -45,3 +46,10 @@ class Evaluate(AgentFlags, BackendFlags):
             print(f"settling   {bound}: {when} ({count} of {len(rows)} episodes)")
         if headline.signed:
             print(f"overshoot  {overshoot}")
+        passage = Passage.of(trajectories)
+        if passage:
+            print(f"touched    {passage.touched:.1%}")
+            print(f"time       {passage.time:.2f} s")
+            print(f"speed      mean {passage.mean_speed:.2f} m/s, top {passage.top_speed:.2f} m/s")
+            print(f"clearance  at least {passage.least_clearance:.2f} m in the mean of flights")
+            print(f"scene      traversability {passage.traversability:.1f}")

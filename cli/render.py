@@ -25,7 +25,7 @@ class Render(EnvFlags):
     """
 
     what: Positional[Annotated[Words, OneOrMore()]]
-    """Checkpoint, folder of a training, pid, geometric, orca, random, or a journal (.mcap).
+    """Checkpoint, folder of a training, pid, geometric, orca, vfh, random, or a journal (.mcap).
     Policies fly evaluation episodes without exploration."""
     out: Path
     """film.mp4, picture.png, or a folder for pictures 0001.png and so on. It must not

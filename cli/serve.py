@@ -15,7 +15,7 @@ class Serve(AgentFlags):
     """
 
     policy: Positional[str]
-    """Checkpoint, folder of a training, pid, geometric or orca."""
+    """Checkpoint, folder of a training, pid, geometric, orca or vfh."""
     listen: Annotated[str | None, arg(metavar="HOST:PORT")] = "127.0.0.1:8001"
     """Address to wait at."""
     episodes: Count | None = None

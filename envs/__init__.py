@@ -34,6 +34,6 @@ __getattr__ = import_when_used(__name__)
 
 for _name in (
     "Elevation", "Hover", "Waypoints", "Tracking", "Racing", "Landing", "Recovery", "PayloadHover",
-    "Formation", "Crossing", "Escort", "Cable", "Forest", "Dodge",
+    "Formation", "Crossing", "Escort", "Cable", "Forest", "Dodge", "Warehouse", "Gates",
 ):  # fmt: skip
     register(f"rotorgram/{_name}-v0", f"rotorgram.envs.tasks:{_name}")

@@ -36,6 +36,7 @@ _PHYSICS = "physics/"
 _MASKS = ("flown", "begun", "active")
 _ENDS = ("terminated", "truncated", "done", "out", "waiting")
 _LAYOUT = "layout"
+_OPENINGS = "openings"
 _SEEN = "seen/"
 _TOLD = "told/"
 _TERM = "told/reward_"
@@ -83,6 +84,9 @@ class Machine:
         given["sent"] = (sent.dtype, sent.shape[1:])
         if world.scenery:
             given[_LAYOUT] = (world.scenery.rows.dtype, (3,))
+        if world.scenery.openings.size:
+            openings = world.scenery.openings
+            given[_OPENINGS] = (openings.dtype, openings.shape[1:])
         given |= fields_of(self._pushed())
         given |= fields_of({_PHYSICS + name: x for name, x in seen.items()})
         self._outside = given | fields_of(self._seen())
@@ -183,6 +187,8 @@ class Machine:
             self._seed(begun, seeds)
         if self._world.scenery:
             given[_LAYOUT][:worlds] = self._world.scenery.rows
+        if _OPENINGS in given:
+            given[_OPENINGS][:worlds] = self._world.scenery.openings
         if not self.is_whole:
             if begun is not None:
                 self._begin(begun)
@@ -343,6 +349,8 @@ class Machine:
         }
         if _LAYOUT in arrays:
             self._loop.world.scenery.rows = arrays[_LAYOUT]
+        if _OPENINGS in arrays:
+            self._loop.world.scenery.openings = arrays[_OPENINGS]
         self._loop.put({name: arrays[name] for name in self._names})
         return arrays
 

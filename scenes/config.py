@@ -17,8 +17,12 @@ NEW_SEEDS = 1 << 28
 FILES = (".toml", ".xml")
 """Endings of files that describe a scene."""
 FOREST_SIZE = (120.0, 120.0)  # m
+GATES_SIZE = 50.0  # m
+OPENING = 5.0
+"""Width of a gate inside, in a scene of `GATES_SIZE`, m: the paper's craft is 2.8 m wide."""
 TREE_DENSITY = 0.0076  # 1/m²
 MAX_TREES = 2000
+_LEAST_SIDE = 10.0  # m: of a forest or a maze
 _LEAST_HALF = 12.0  # m: half of a forest or a maze at least, around a middle that is clear
 
 
@@ -41,8 +45,9 @@ class SceneConfig:
     `unseen`: the same, of layouts that `new` never has, for tests of what was learned."""
     density: Annotated[float | None, Limits(1e-4, 0.5, "1/m²")] = None
     """Trees per square metre of a forest."""
-    size: Annotated[tuple[float, float] | None, Limits(10.0, 400.0, "m", count=2)] = None
-    """Of a forest or a maze along x and y, m."""
+    size: Annotated[tuple[float, float] | None, Limits(4.0, 400.0, "m", count=2)] = None
+    """Along x and y, m: of a forest, of a maze, of aisles, or of a square of gates, which grow with
+    it: those of 50 m are 5 m wide."""
     clear: Literal["middle", "ends"] = "middle"
     """Where a forest or a maze leaves room for craft: 8 m about the z axis, or 2 m about the
     middles of both of its ends in x."""
@@ -80,7 +85,14 @@ class SceneConfig:
                 able = [name for name, kind in SCENES.items() if option in kind.options]
                 expected = f"{option} with the scene {' or '.join(able)} alone"
                 raise InputError(f"scene: expected {expected}, got {self.name}")
-        widest = max(self.size or FOREST_SIZE)
+        if self.name == "gates" and len(set(self.size or ())) > 1:
+            raise InputError(f"scene: expected a square of gates, got {self}")
+        if not (self.size and "clear" in self.type.options):
+            return
+        narrowest, widest = sorted(self.size)
+        if narrowest < _LEAST_SIDE:
+            expected = f"sides of at least {_LEAST_SIDE:g} m"
+            raise InputError(f"scene: expected {expected}, got {narrowest:g} m")
         if self.clear == "middle" and widest < 2 * _LEAST_HALF:
             expected = f"a size of {2 * _LEAST_HALF:g} m or more, or clear=ends"
             raise InputError(f"scene: expected {expected}, got a size of {widest:g} m")
@@ -90,6 +102,18 @@ class SceneConfig:
         """How many a forest has."""
         wide, deep = self.size or FOREST_SIZE
         return round(wide * deep * (self.density or TREE_DENSITY))
+
+    @property
+    def scale(self) -> float:
+        """How large gates are: 1 in a scene of `GATES_SIZE`."""
+        return (self.size or (GATES_SIZE,))[0] / GATES_SIZE
+
+    @property
+    def room(self) -> float:
+        """Half the width of the space about the z axis that is clear, m."""
+        if self.clear == "ends":
+            return 0.0
+        return self.type.room * (self.scale if self.name == "gates" else 1.0)
 
     def __str__(self) -> str:
         """The text that `parse` reads."""

@@ -5,6 +5,7 @@ World frame: z up, m. A generator draws what stands in a scene from one stream, 
 
 import math
 from collections.abc import Callable, Sequence
+from functools import lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -13,19 +14,18 @@ from numpy.typing import NDArray
 
 from ..models.errors import InputError
 from ..models.files import read_own_toml
-from .config import FOREST_SIZE, SceneConfig
+from .aisles import aisles, most_of_aisles
+from .config import FOREST_SIZE, OPENING, SceneConfig
 from .kernels import KINDS
 from .maze import maze, most_walls
 from .motion import REST
-from .registry import SceneType, register
+from .registry import CLEARANCE, SceneType, register
 from .traffic import most_of_traffic, traffic
 
 Array = NDArray[np.float64]
 
 SPHERE, CAPSULE, CYLINDER, BOX, _ = range(len(KINDS))
 
-CLEARANCE = 8.0
-"""Half the width of the space about the z axis, 20 m high, that nothing but a gate enters, m."""
 _MATERIALS = read_own_toml(__file__, "materials")
 """By scene and name."""
 
@@ -42,7 +42,6 @@ _ROCK_DENSITY = 1 / 360
 _ROCK_REACH = 1.2  # m
 _ENDS = 2.0  # m: radius of the clear spaces at the ends of a forest
 _GATES = 8
-_OPENING = 5.0  # m: the paper's craft is 2.8 m wide with its rotors
 
 
 Names = Callable[[], Sequence[str]]
@@ -71,6 +70,9 @@ class Draft:
     def __init__(self, scene: SceneConfig, seed: int) -> None:
         self.scene = scene
         self.parts: list[Parts] = []
+        self.openings: list[tuple[float, ...]] = []
+        """In the order in which they are passed: center, x and y of the direction, half the width,
+        m."""
         self.rng = np.random.Generator(np.random.PCG64(seed))
 
     def uniform(self, low: float, high: float) -> float:
@@ -241,7 +243,10 @@ def _add_goods(hall: Draft, number: int) -> None:
 
 
 def gates(track: Draft) -> None:
-    """A ring of 8 gates, 5 m wide inside, with barriers, cones and stands around it."""
+    """A ring of 8 gates, 5 m wide inside, with barriers, cones and stands around it.
+
+    All but the ground has the scale of the scene.
+    """
     track.add("ground/floor", "plane", (150, 150, 1), (0, 0, 0), "grass")
     for i in range(_GATES):
         _add_gate(track, i)
@@ -262,10 +267,16 @@ def gates(track: Draft) -> None:
             position = (distance * math.cos(angle), distance * math.sin(angle), height)
             size = (0.75, 9.0, height)
             track.add(f"stand_{i}/row_{row}", "box", size, position, "stand", angle)
+    ground, *others = track.parts
+    scale = track.scene.scale
+    scaled = [
+        one._replace(sizes=scale * one.sizes, positions=scale * one.positions) for one in others
+    ]
+    track.parts = [ground, *scaled]
 
 
 def _add_gate(track: Draft, number: int) -> None:
-    half = _OPENING / 2
+    half = OPENING / 2
     bar = 0.25
     angle = 2 * math.pi * number / _GATES + track.uniform(-0.15, 0.15)
     radius = track.uniform(15.0, 20.0)
@@ -274,6 +285,9 @@ def _add_gate(track: Draft, number: int) -> None:
     tint = track.choose("paint")
     x = radius * math.cos(angle)
     y = radius * math.sin(angle)
+    scale = track.scene.scale
+    center = (scale * x, scale * y, scale * height)
+    track.openings.append((*center, math.cos(heading), math.sin(heading), scale * half))
     foot = (height - half - 2 * bar) / 2
     for part, sign in (("left", 1), ("right", -1)):
         aside = sign * (half + bar)
@@ -294,16 +308,29 @@ def _most_of_forest(scene: SceneConfig) -> int:
 
 def parts_of(scene: SceneConfig, seed: int) -> list[Parts]:
     """What stands in a scene, but for what its MJCF file has."""
+    return _drafted(scene, seed).parts
+
+
+def openings_of(scene: SceneConfig, seed: int) -> Array:
+    """Gates of a scene in their order, or ways through its rows of racks, shape (K, 6).
+
+    The center, m; x and y of the direction in which it is passed; half the width, m.
+    """
+    return np.array(_drafted(scene, seed).openings).reshape(-1, 6)
+
+
+@lru_cache(maxsize=4)
+def _drafted(scene: SceneConfig, seed: int) -> Draft:
     draft = Draft(scene, seed)
     draw = scene.type.draw
     if draw is None:
-        return []
+        return draft
     draw(draft)
     most = scene.type.most(scene)
     count = sum(len(one.kinds) for one in draft.parts)
     if count > most:
         raise InputError(f"scene: expected at most {most} parts of {scene.name}, got {count}")
-    return draft.parts
+    return draft
 
 
 register(
@@ -316,12 +343,22 @@ register(
     ),
 )
 register("warehouse", SceneType(draw=warehouse, materials=_MATERIALS["warehouse"]))
-register("gates", SceneType(draw=gates, materials=_MATERIALS["gates"]))
+register("gates", SceneType(draw=gates, materials=_MATERIALS["gates"], options=("size",)))
+register(
+    "aisles",
+    SceneType(
+        draw=aisles,
+        materials=_MATERIALS["aisles"],
+        most=most_of_aisles,
+        room=0.0,
+        options=("size",),
+    ),
+)
 register(
     "maze",
     SceneType(draw=maze, materials=_MATERIALS["maze"], most=most_walls, options=("size", "clear")),
 )
 register(
     "traffic",
-    SceneType(draw=traffic, materials=_MATERIALS["traffic"], most=most_of_traffic),
+    SceneType(draw=traffic, materials=_MATERIALS["traffic"], most=most_of_traffic, room=0.0),
 )

@@ -33,7 +33,7 @@ _PATTERNS = {
 def add_parts(spec: MjSpec, scene: SceneConfig) -> None:
     """Add a scene from a seed to a spec. Nothing of it touches or weighs anything."""
     painter = Painter(spec, scene)
-    if scene.name == "warehouse":
+    if scene.name in ("warehouse", "aisles"):
         _lamps(painter)
     else:
         painter.sun()

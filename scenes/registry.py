@@ -11,6 +11,8 @@ if TYPE_CHECKING:
     from .config import SceneConfig
     from .generators import Draft
 
+CLEARANCE = 8.0
+"""Of our scenes the `room`, m."""
 MAX_SOLIDS = 10_000
 """Most primitives of a scene."""
 MAX_DRAWN = 512
@@ -27,6 +29,8 @@ class SceneType:
     """Looks by name, as in `materials.toml`."""
     most: "Callable[[SceneConfig], int]" = lambda _: MAX_DRAWN
     """At least as many as any layout has parts."""
+    room: float = CLEARANCE
+    """Half the width of the space about the z axis, 20 m high, that only gates enter, m."""
     options: tuple[str, ...] = ()
     """Which of `density`, `size` and `clear` it has."""
 

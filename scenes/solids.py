@@ -37,6 +37,8 @@ _SHEET = 5e-4  # m: half the thickness of a plane of a size, which lies below it
 _MARK = 10.0  # m: half the width of level ground; what is smaller is a mark on it
 # An unused column of a table is out of reach: its center is far along its first axis.
 _NOTHING = np.eye(kernels.ROWS)[0, :, None] * _ENDLESS + np.eye(kernels.ROWS)[3, :, None]
+_MARCHES = 60  # steps along a way, each up to the next solid
+_TOUCH = 1e-3  # m: a solid that is so near is touched
 _CHUNK = 1 << 22  # numbers that a step of `distance` has at once
 
 
@@ -219,6 +221,34 @@ class Solids:
             for first in range(0, len(rows), count)
         ]
         return np.concatenate([np.empty(0), *parts]).reshape(given.shape[:-1])
+
+    def traversability(
+        self, radius: float, low: ArrayLike, high: ArrayLike, count: int = 500
+    ) -> float:
+        """How far a sphere flies straight before it touches a solid, in its radii: the mean.
+
+        It starts where it has room, at `count` random places between the corners `low` and `high`,
+        m, in random level directions; a way ends at the border at the latest. The measure of
+        difficulty of AvoidBench (H. Yu, G. de Croon and C. De Wagter, 2023), from S. Nous et al.
+        2016; the lower, the harder. The same solids have the same number. 0 where there is no room.
+        """
+        check("radius", Limits(1e-3, 1e3, "m"), radius)
+        first, last = numbers("low", low), numbers("high", high)
+        rng = np.random.Generator(np.random.PCG64(0))
+        places = rng.uniform(first, last, (count, 3))
+        turns = rng.uniform(0.0, 2 * np.pi, count)
+        has_room = self.distance(places) > radius
+        place, turn = places[has_room], turns[has_room]
+        if not len(place):
+            return 0.0
+        ahead = np.stack((np.cos(turn), np.sin(turn), 0.0 * turn), axis=-1)
+        border = np.where(ahead > 0.0, last, first)[:, :2] - place[:, :2]
+        furthest = (border / ahead[:, :2]).min(axis=1)
+        way = np.zeros(len(place))
+        for _ in range(_MARCHES):  # no solid is nearer than the distance
+            gap = self.distance(place + way[:, None] * ahead) - radius
+            way = np.minimum(way + np.where(gap > _TOUCH, gap, 0.0), furthest)
+        return float(way.mean() / radius)
 
     def field(self, low: ArrayLike, high: ArrayLike, cell: float) -> Array:
         """`distance` at the centers of the cells of a grid (an ESDF), shape (X, Y, Z).

@@ -152,7 +152,13 @@ class Draw:
     """Draws numbers for the worlds that begin an episode; for the others it gives zeros.
 
     `ahead` is 1 for draws before the `Random.begin` of their episode.
+
+    Attributes:
+        openings: Of a start, those of the layout of each world, as of `Scenery`, (W, 1, K, 6); None
+            where it has none.
     """
+
+    openings: Array = None
 
     def __init__(self, random: Random, use: int, mask: Mask, ahead: int = 0) -> None:
         self._random = random

@@ -8,6 +8,7 @@ from ..models.errors import InputError
 from ..models.vehicle import Vehicle, can_touch, craft_geoms
 from ..scenes import SceneConfig, kernels
 from ..scenes.config import NEW_SEEDS
+from ..scenes.generators import openings_of
 from ..scenes.motion import REST, offsets
 from ..scenes.solids import Layouts, Solids
 from .compile import Untraceable
@@ -31,6 +32,8 @@ class Scenery(Kept):
         moves: Whether solids move.
         rows: Of each world's layout how many primitives it has, and the addresses of their kinds
             and of their table, uint64, shape (W, 3); variables in code that is being compiled.
+        openings: Of each world's layout, as of `generators.openings_of`, shape (W, K, 6); variables
+            too.
     """
 
     arrays = ("seeds",)
@@ -44,6 +47,9 @@ class Scenery(Kept):
         self._always = Solids.ground() + own
         laid = [self._always + self.solids(seed) for seed in self._given.tolist()]
         self.layouts = Layouts.of(*laid)
+        found = [openings_of(scene, seed) for seed in self._given.tolist() or [0]]
+        self._openings = np.array(found)
+        self.openings: Array = np.zeros((worlds, *found[0].shape))
         self.moves = bool(self.solids(0).moves.any())
         if self.moves:  # each world has a time of its own
             most = self.most
@@ -176,6 +182,7 @@ class Scenery(Kept):
             self.which = np.arange(count)
         for world, solids in made.items():
             self.layouts.put(world, self._always, solids)
+            self.openings[world] = openings_of(self.scene, int(self.seeds[world]))
             if self.moves:
                 self._motions[world, : len(solids)] = solids.motions
                 self._motions[world, len(solids) :] = REST
@@ -188,7 +195,9 @@ class Scenery(Kept):
         return self.layouts.tables[:, :3, first : first + self.most]
 
     def _point(self) -> None:
-        """Set `rows`."""
+        """Set `rows`, and the openings of given layouts."""
+        if self._given.size and not self.moves:
+            self.openings = self._openings[self.which]
         self.rows = np.empty((len(self.seeds), 3), np.uint64)
         self.rows[:, 0] = self.layouts.kinds.shape[1]
         arrays: tuple[Array, Array] = self.layouts

@@ -120,7 +120,11 @@ class World(NotCopied):
 
     def draw(self, mask: Array) -> Draw:
         """Draws for the next start of the worlds of a mask, before their `reset`."""
-        return Draw(self.random, START, mask, ahead=1)
+        draw = Draw(self.random, START, mask, ahead=1)
+        if self.scenery.openings.size:
+            self.scenery.begin(self.random, mask, ahead=1)
+            draw.openings = self.scenery.openings[:, None]
+        return draw
 
     def reset(self, mask: Array, pose: InitialState) -> None:
         """Reset the worlds of the mask, bool, shape (W, A), to their rows of `pose`.

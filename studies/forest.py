@@ -1,16 +1,19 @@
 """Flight by sight through woods that no training has seen: PPO on Forest-v0, over several seeds.
 
     python studies/forest.py [--seeds 5] [--first-seed 4100] [--flights 1000] [--out FILE.json]
+    python studies/forest.py --vfh    # its flights anew, the others' as they are in the file
 
 A training is `rotorgram train ppo --env rotorgram/Forest-v0` with its tuned preset, motor lag, the
 noise of the depth camera, 1 tree per 8 m², and a speed from 2.5 to 5.5 m/s drawn for each episode;
 the clock runs from before its process starts to its end. Each policy then flies `--flights` unseen
 layouts at 3 and at 5 m/s, with 1 tree per 10 m² and per 8 m². Beside it `straight` flies at the
-goal and looks at nothing. Intervals are Wilson's, at 95 %, of all flights of a row.
+goal and looks at nothing, and `vfh` (VFH+) steers by a level lidar of 360 rays at 10 Hz. Intervals
+are Wilson's, at 95 %, of all flights of a row.
 
 It takes about 40 minutes on two cores.
 """
 
+import json
 import subprocess
 import sys
 import tempfile
@@ -21,10 +24,11 @@ from typing import Any
 import numpy as np
 from measuring import RESULTS, options, write
 from rotorgram.agents import load
+from rotorgram.agents.vfh import Vfh
 from rotorgram.envs import LocalVectorEnv
 from rotorgram.envs.config import EnvConfig
 from rotorgram.envs.spec import EnvSpec
-from rotorgram.flights.trajectories import fly_episodes
+from rotorgram.flights.trajectories import evaluation_seed, fly_episodes
 from rotorgram.training.statistics import share_interval
 
 WORDS = ("ppo", "--env", "rotorgram/Forest-v0", "--effects", "motor_lag", "--env.density", "0.125",
@@ -56,22 +60,46 @@ def train(seed: int, folder: Path) -> float:
     return round(time.perf_counter() - began, 1)
 
 
-def fly(policy: Any, flights: int, density: float, speed: float, seed: int) -> dict[str, Any]:
-    """Of flights in unseen layouts: how many arrive, touch, or neither, and means."""
+def woods(flights: int, density: float, speed: float, **more: Any) -> LocalVectorEnv:
+    """So many unseen layouts."""
     config = EnvConfig.from_keywords(
         "rotorgram/Forest-v0", backend="rigid", effects={"motor_lag": True}, density=density,
-        speed=speed,
+        speed=speed, **more,
     ).unseen()  # fmt: skip
-    env = LocalVectorEnv(config, flights, autoreset_mode="Disabled")
+    return LocalVectorEnv(config, flights, autoreset_mode="Disabled")
+
+
+def fly(policy: Any, flights: int, density: float, speed: float, seed: int) -> dict[str, Any]:
+    """Of flights in unseen layouts: how many arrive, touch, or neither, and means."""
+    env = woods(flights, density, speed)
     pilot = policy(env.env_spec)
     flown = fly_episodes(env, pilot, flights, "final", training_seed=seed)
     env.close()
+    return counted(env, np.array([one.telemetry["metrics"][-1] for one in flown]))
+
+
+def fly_vfh(flights: int, density: float, speed: float) -> dict[str, Any]:
+    """The same of VFH+, all drones at once, in the layouts of `straight`."""
+    env = woods(flights, density, speed, **Vfh.options)
+    pilot = Vfh(env.env_spec)
+    env.reset(seed=[evaluation_seed(number, "final", 0) for number in range(flights)])
+    nobody = done = np.zeros(flights, bool)
+    last = env.telemetry["metrics"]
+    while not done.all():
+        env.advance(pilot.actions(env.observations), nobody, None, done)
+        last = np.where(done[:, None], last, env.telemetry["metrics"])
+        done = done | env.terminated | env.truncated
+    env.close()
+    return counted(env, last)
+
+
+def counted(env: LocalVectorEnv, last: np.ndarray) -> dict[str, Any]:
+    """Counts and means of the metrics at the ends of flights, (N, metrics)."""
     names = [metric.name for metric in env.env_spec.metrics]
-    last = np.array([one.telemetry["metrics"][-1] for one in flown])
     told = dict(zip(names, last.T, strict=True))
     arrived = told["success"] > 0.5
     row = {
-        "flights": flights,
+        "flights": len(last),
         "arrived": int(arrived.sum()),
         "touched": int((told["touched"] > 0.5).sum()),
     }
@@ -81,8 +109,15 @@ def fly(policy: Any, flights: int, density: float, speed: float, seed: int) -> d
 
 def main() -> None:
     args = options(
-        __doc__, seeds=5, first_seed=4100, flights=1000, out=RESULTS / "forest.json"
+        __doc__, seeds=5, first_seed=4100, flights=1000, vfh=False, out=RESULTS / "forest.json"
     ).parse_args()
+    steered = [fly_vfh(args.flights, *case) for case in CASES]
+    if args.vfh:
+        content = json.loads(args.out.read_text())
+        for case, row in zip(content["cases"], steered, strict=True):
+            case["vfh"] = row
+        write(args.out, content)
+        return
     seeds: list[dict[str, Any]] = []
     straight = [fly(Straight, args.flights, *case, seed=0) for case in CASES]
     for seed in range(args.first_seed, args.first_seed + args.seeds):
@@ -101,6 +136,7 @@ def main() -> None:
             case = {"density": density, "speed": speed, "flights": flights, "arrived": arrived}
             case |= {"share": round(arrived / flights, 4), "low": round(low, 4)}
             case |= {"high": round(high, 4), "straight": straight[number]}
+            case["vfh"] = steered[number]
             for name in MEANS:
                 case[name] = round(float(np.mean([row[name] for row in own])), 3)
             cases.append(case)

@@ -29,7 +29,8 @@ HASHES = DATA / "hashes.json"
 TABLES: dict[str, Any] = json.loads((DATA / "envs.json").read_text())
 """Rows of the parametrized tests of envs/, by the tests' names."""
 TASKS = sorted(name for name in gym.registry if name.startswith("rotorgram/"))
-TASKS.append(TASKS.pop(TASKS.index("rotorgram/Forest-v0")))  # others keep their vehicles
+for name in ("Forest", "Warehouse", "Gates", "Dodge"):  # others keep their vehicles
+    TASKS.append(TASKS.pop(TASKS.index(f"rotorgram/{name}-v0")))
 HOVER = "rotorgram/Hover-v0"
 ELEVATION = "rotorgram/Elevation-v0"
 NOW = np.bool_(True)

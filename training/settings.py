@@ -149,7 +149,7 @@ class Row:
         return self.agent in CONTROLLERS
 
     @property
-    def brought(self) -> Mapping[str, str]:
+    def brought(self) -> Mapping[str, object]:
         """Options of the env that a controller needs."""
         return CONTROLLERS[self.agent].options if self.controller else {}
 

@@ -3,8 +3,8 @@
 from ... import import_when_used
 
 __all__ = [
-    "Cable", "Crossing", "Dodge", "Elevation", "Escort", "Forest", "Formation", "Hover", "Landing",
-    "PayloadHover", "Racing", "Recovery", "Tracking", "Waypoints",
+    "Cable", "Crossing", "Dodge", "Elevation", "Escort", "Forest", "Formation", "Gates", "Hover",
+    "Landing", "PayloadHover", "Racing", "Recovery", "Tracking", "Warehouse", "Waypoints",
 ]  # fmt: skip
 
 _modules = {name: f".{name.lower()}" for name in __all__} | {"PayloadHover": ".payload_hover"}

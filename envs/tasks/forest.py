@@ -30,9 +30,6 @@ from .task import Outcome, Task, TaskOptions
 AISLE = 2.0
 """From the ends of the wood to start and goal, m."""
 _WAY = (10.0, 100.0)  # m
-_REACHED = 1.0  # m: of the goal, in the plane and in height
-_LOW, _HIGH = 1.3, 2.2  # m: heights of start and goal
-_CEILING = 4.0  # m: a craft does not fly over the wood
 _BEHIND = 3.0  # m: that a craft may be behind start or goal
 _SPEEDING = 0.025  # s/m: cost of a step that is faster than wanted, by up to 1 m/s
 _ASIDE = 0.015  # 1/m: cost of another height than the goal's, by up to 1 m
@@ -98,7 +95,13 @@ class Forest(Task):
     0.05 s.
     """
 
-    Options = ForestOptions
+    Options: ClassVar[type[TaskOptions]] = ForestOptions
+    heights: ClassVar[tuple[float, float]] = (1.3, 2.2)
+    """Lowest and highest start and goal, m."""
+    ceiling: ClassVar[float] = 4.0
+    """A craft does not fly over what stands there, m."""
+    reached: ClassVar[float] = 1.0
+    """Largest distance of an arrival from the goal, in the plane and in height, m."""
     worst_step = -(_SPEEDING + _ASIDE + _NEAR + 2 * _CHANGE)
     action = "velocity"
     control_period = 0.05
@@ -127,18 +130,24 @@ class Forest(Task):
     def setup(self) -> None:
         """See the class."""
         options = self.options
-        self._half = options.way / 2
-        slowest, _ = ends_of(options.speed)
-        least = options.way / (_SHARE * self.episode_length * self.control_period)
-        if slowest < least and self.episode_length == type(self).episode_length:
-            expected = f"at least {least:.3g} m/s, for {options.way:g} m in the time of an episode"
-            raise InputError(f"speed: expected {expected}, got {slowest:g}")
         scene = self.config.scene
         long = (scene.size or (0.0,))[0] >= options.way + 2 * AISLE
         if scene.name == "forest" and not (scene.clear == "ends" and long):
             expected = f"clear=ends and at least {options.way + 2 * AISLE:g} m along x"
             raise InputError(f"scene: expected {expected}, got {scene}")
-        furthest = options.way + options.width
+        self.define_way(options.way, options.width)
+
+    def define_way(self, way: float, width: float) -> None:
+        """Set `observation`, for a way to the goal and the width about it, m."""
+        options = self.options
+        self._half = way / 2
+        self._aside = width / 2
+        slowest, _ = ends_of(options.speed)
+        least = way / (_SHARE * self.episode_length * self.control_period)
+        if slowest < least and self.episode_length == type(self).episode_length:
+            expected = f"at least {least:.3g} m/s, for {way:g} m in the time of an episode"
+            raise InputError(f"speed: expected {expected}, got {slowest:g}")
+        furthest = way + width
         numbers = along("wanted velocity", "m/s", MAX_SPEED, "xy")
         numbers.append(Number("goal - height", "m", -10.0, 10.0))
         numbers += along("velocity", "m/s", MAX_SPEED) + along("thrust axis", "1", 1.001)
@@ -155,12 +164,12 @@ class Forest(Task):
         self._bounds = array.bounds()
 
     def begin(self, mask: Array, draw: Draw) -> InitialState:
-        """At rest before the wood, looking at the goal."""
-        height = draw.uniform(_LOW, _HIGH, (2,))
+        """At rest before what is to be crossed, looking at the goal."""
+        height = draw.uniform(*self.heights, (2,))
         memory = self.memory
         memory.height = height[..., 1]
         memory.speed = draw.uniform(*ends_of(self.options.speed))
-        memory.way = 0.0 * memory.speed + self.options.way
+        memory.way = 0.0 * memory.speed + 2 * self._half
         memory.progress = memory.change = memory.path = memory.top = 0.0
         memory.least = 0.0 * memory.speed + np.inf
         memory.last = np.zeros_like(height, shape=(*mask.shape, len(self.controller.components)))
@@ -168,14 +177,14 @@ class Forest(Task):
         return InitialState(position=start)
 
     def goal(self, state: State) -> Array:
-        """Behind the wood."""
+        """Behind what is to be crossed."""
         height = self.memory.height
         return stack((0.0 * height + self._half, 0.0 * height, height))
 
     def update_memory(self, state: State) -> None:
         """How much shorter the way became; what was flown; what came nearest."""
         memory = self.memory
-        way = self._way(state)
+        way = self.way(state.position)
         memory.progress = memory.way - way
         memory.way = way
         change = state.action - memory.last
@@ -198,7 +207,7 @@ class Forest(Task):
 
         to_goal = self.goal(state) - state.position
         dx, dy, up = parts_of(to_goal)
-        way = self._way(state)
+        way = self._straight(state.position)
         wanted = memory.speed / (way + 1e-6)
         vx, vy, vz = parts_of(state.velocity)
         ax, ay, az = parts_of(body_z(state.quaternion))
@@ -215,11 +224,11 @@ class Forest(Task):
         memory = self.memory
         position = state.position
         off = abs(position[..., 2] - memory.height)
-        arrived = (memory.way < _REACHED) & (off < _REACHED)
+        arrived = (memory.way < self.reached) & (off < self.reached)
         beside = (
-            (abs(position[..., 1]) > self.options.width / 2)
+            (abs(position[..., 1]) > self._aside)
             | (abs(position[..., 0]) > self._half + _BEHIND)
-            | (position[..., 2] > _CEILING)
+            | (position[..., 2] > self.ceiling)
         )
         touched = state.touching
         crashed = touched | beside | (state.tilt_cosine < LEAST_TILT_COSINE)
@@ -246,7 +255,16 @@ class Forest(Task):
         }
         return Outcome(reward=terms, terminated=crashed | success, metrics=metrics)
 
-    def _way(self, state: State) -> Array:
+    def way(self, position: Array) -> Array:
+        """Length of the way to the goal, of which the reward counts the progress, m, (W, A)."""
+        return self._straight(position)
+
+    def _straight(self, position: Array) -> Array:
         """To the goal in the plane, m."""
-        x, y, _ = parts_of(self.goal(state) - state.position)
-        return square_root(x * x + y * y)
+        x, y, _ = parts_of(position)
+        return distance_of(self._half - x, y)
+
+
+def distance_of(x: Array, y: Array) -> Array:
+    """Length of a vector in the plane."""
+    return square_root(x * x + y * y)

@@ -266,6 +266,18 @@ def check_height(name: str, height: float, room: float) -> None:
         )
 
 
+def check_room(task: Task, reach: float) -> None:
+    """Refuse a scene that leaves less room about the z axis than starts and goals need, m.
+
+    Raises `InputError`.
+    """
+    scene = task.config.scene
+    needed = reach + task.vehicle.radius
+    if scene.is_seeded and scene.room < needed:
+        expected = f"one that leaves {needed:.3g} m about the z axis to {task.config.env_id}"
+        raise InputError(f"scene: expected {expected}, got {scene}, which leaves {scene.room:.3g}")
+
+
 def check_more(name: str, size: float, what: str, least: float) -> None:
     """Refuse an option, m, that is no larger than something. Raises `InputError`."""
     if size <= least:

@@ -18,6 +18,7 @@ from .goal import (
     Upright,
     along,
     check_more,
+    check_room,
     ends_of,
     rates_cost,
 )
@@ -134,6 +135,7 @@ class Landing(GoalTask):
     def setup(self) -> None:
         """See the class."""
         options = self.options
+        check_room(self, options.pad_path + options.pad_radius + options.start_band)
         fastest = ends_of(options.pad_speed)[1] + 0.001
         pad = along("velocity of the pad", "m/s", fastest, "xy")
         self.define_observation(options.flight_band, pad)

@@ -5,7 +5,7 @@ import math
 import tomllib
 from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, ClassVar
 
 import numpy as np
 
@@ -138,7 +138,7 @@ class Racing(GoalTask):
     the next (`margin`), a tilt above 90°, or contact. *Truncated*: after 1500 steps of 0.02 s.
     """
 
-    Options = RacingOptions
+    Options: ClassVar[type[TaskOptions]] = RacingOptions
     worst_step = COURSE_WORST_STEP
     episode_length = 1500
     metrics = (
@@ -152,38 +152,50 @@ class Racing(GoalTask):
         gates, self._start = read_track(self.options.track)
         room = self.vehicle.rest_height + self.options.start_band
         check_height("track: start", self._start.position[2], room)
-        self._count = len(gates)
-        self._total = self._count * self.options.laps
         self.marks = tuple(
             Mark(shape="gate", size=gate.size, position=gate.position, heading=gate.heading)
             for gate in gates
         )
         turns = np.radians([gate.heading for gate in gates])
-        # Of each gate its centre, the x and y of its direction, and half its size.
         centers = np.array([gate.position for gate in gates])
         halves = np.array([gate.size / 2 for gate in gates])
         self._gates = np.column_stack((centers, cos(turns), sin(turns), halves))
         corners = np.vstack((centers, self._start.position))
         reach = length(np.ptp(corners, axis=0)) + 2 * self.options.margin
+        self.define_race(len(gates), reach, float(halves.max()))
+
+    def define_race(self, count: int, reach: float, half: float) -> None:
+        """Set `observation`, for gates of half a size and within a reach of each other, m."""
+        self._count = count
+        self._total = count * self.options.laps
         numbers = along("direction of the gate", "1", 1.001, "xy")
         numbers += along("gate after - position", "m", reach)
         numbers += along("direction of the gate after", "1", 1.001, "xy")
-        half = float(halves.max()) + 0.001
-        numbers.append(Number("half size of the gate", "m", -half, half))
+        largest = half + 0.001
+        numbers.append(Number("half size of the gate", "m", -largest, largest))
         self.define_observation(reach / 2, numbers)
+
+    @property
+    def track(self) -> Array:
+        """Gates: their centers, x and y of their directions, half their sizes, (..., count, 6)."""
+        return self._gates
 
     def begin(self, mask: Array, draw: Draw) -> InitialState:
         """At rest near the start, the nose along the track."""
         offset = self.offset(draw)
         position = np.array(self._start.position) + offset
         half = math.radians(self._start.heading) / 2
+        zero = 0.0 * offset[..., 0]
+        turn = stack((zero + cos(half), zero, zero, zero + sin(half)))
+        return self.start(position, turn)
+
+    def start(self, position: Array, turn: Array) -> InitialState:
+        """A start at rest, m, and its quaternion, (W, A, 4), with the memory of a race."""
         memory = self.memory
         memory.position = position  # before the last step
         memory.behind = position  # where the way to the next gate began
         memory.passed = memory.passing = memory.progress = memory.off = 0.0
         memory.lap = memory.lap_began = 0.0
-        zero = 0.0 * offset[..., 0]
-        turn = stack((zero + cos(half), zero, zero, zero + sin(half)))
         return InitialState(position=position, quaternion=turn)
 
     def update_memory(self, state: State) -> None:
@@ -245,7 +257,7 @@ class Racing(GoalTask):
     def _gate(self, passed: Array) -> Array:
         """The next gate after `passed` gates, shape (..., 6); after the last gate, the last."""
         number = np.minimum(passed, self._total - 1.0)
-        return row_of(self._gates, remainder(number, self._count))
+        return row_of(self.track, remainder(number, self._count))
 
 
 def read_track(given: str) -> tuple[list[Gate], Start]:

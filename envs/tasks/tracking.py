@@ -16,6 +16,7 @@ from .goal import (
     Size,
     along,
     check_height,
+    check_room,
     nearness,
 )
 from .task import Outcome, TaskOptions
@@ -99,6 +100,7 @@ class Tracking(GoalTask):
         low = self._table.min(axis=0)
         high = self._table.max(axis=0)
         check_height("trajectory", low[2], self.vehicle.rest_height + options.start_band)
+        check_room(self, float(abs(self._table[:, :2]).max()) + options.start_band)
         reach = length(high - low) + 2 * options.flight_band
         numbers = along("reference velocity", "m/s", 100.0)
         self._ahead = []

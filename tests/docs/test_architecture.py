@@ -100,7 +100,9 @@ def test_a_task_knows_the_world_and_the_spec() -> None:
         "rotorgram.envs.memory",
         "rotorgram.envs.state",
         "rotorgram.envs.spec",
+        "rotorgram.envs.tasks.forest",
         "rotorgram.envs.tasks.goal",
+        "rotorgram.envs.tasks.racing",
         "rotorgram.envs.tasks.swarm",
         "rotorgram.envs.tasks.task",
     }

@@ -97,7 +97,7 @@ def test_no_later_bit_differs_after_a_restore(case: Case) -> None:
 @every_case
 def test_what_is_refused_changes_nothing(case: Case) -> None:
     loop = Loop(case.config(), WORLDS)
-    flight(loop, range(3))
+    flight(loop, range(1))
     before = bits(loop.snapshot())
     rows = loop.num_envs
     good = next(contracts.actions_of(loop))

@@ -1,0 +1,95 @@
+"""`rotorgram/Gates-v0`: a race through gates that are solid, along a track of each episode."""
+
+from collections.abc import Mapping
+from typing import Annotated, ClassVar
+
+from ...models import InputError
+from ...models.fields import Limits, immutable
+from ...scenes import SceneConfig
+from ...scenes.config import GATES_SIZE, OPENING
+from ...sim import Array, Draw, InitialState, square_root, stack
+from .goal import Distance, Margin
+from .racing import MAX_LAPS, Racing
+from .task import TaskOptions
+
+_COUNT = 8
+_RING = 40.0  # m: width of the ring of gates, and their highest, at the scale 1
+_BEHIND = 4.0  # m: from the start to the first gate, at the scale 1
+
+
+@immutable
+class GatesOptions(TaskOptions):
+    """Options of `rotorgram/Gates-v0`."""
+
+    opening: Annotated[float, Limits(1.0, 20.0, "m")] = 1.5
+    """Width of a gate inside, m; the track grows with it."""
+    laps: Annotated[int, Limits(1, MAX_LAPS, whole=True)] = 1
+    """Rounds of all gates."""
+    start_band: Distance = 0.1
+    """Largest distance of the start from the line through the first gate along each axis, m."""
+    margin: Margin = 3.0
+    """As of `rotorgram/Racing-v0`, m."""
+
+
+class Gates(Racing):
+    """Pass solid gates in their order and direction, as fast as possible.
+
+    The track is that of the scene `gates`: a ring of eight gates whose places, heights and
+    directions are drawn from a seed, another one in each episode. A touch ends the episode.
+
+    ## Observation, `float32`, shape (23 + R,)
+
+    That of `Racing-v0`.
+
+    ## Action
+
+    By the option `action`; with `rotors` the thrust of each rotor.
+
+    ## Reward
+
+    That of `Racing-v0`, and so are its metrics.
+
+    ## Start, termination, truncation
+
+    At rest before the first gate, the nose towards it, within 0.1 m along each axis (`start_band`).
+
+    *Terminated*: the last gate is passed; further than 3 m from the line between the last gate and
+    the next (`margin`), a tilt above 90°, or contact. *Truncated*: after 1500 steps of 0.02 s.
+    """
+
+    Options = GatesOptions
+    defaults: ClassVar[Mapping[str, object]] = {"vehicle": ("hummingbird",)}
+
+    @classmethod
+    def scene(cls, options: GatesOptions) -> SceneConfig:
+        """A new track in each episode."""
+        side = GATES_SIZE * options.opening / OPENING
+        return SceneConfig(name="gates", layouts="new", size=(side, side))
+
+    def setup(self) -> None:
+        """See the class."""
+        scene = self.config.scene
+        if scene.name != "gates":
+            raise InputError(f"scene: expected gates with {self.config.env_id}, got {scene}")
+        half = scene.scale * OPENING / 2
+        if half <= self.vehicle.radius:
+            expected = f"gates wider than the craft, {2 * self.vehicle.radius:.3g} m"
+            raise InputError(f"opening: expected {expected}, got {2 * half:g} m")
+        reach = 2 * scene.scale * _RING + 2 * self.options.margin
+        self.define_race(_COUNT, reach, half)
+
+    @property
+    def track(self) -> Array:
+        """That of the episode's layout, (W, A, 8, 6)."""
+        return self.memory.track
+
+    def begin(self, mask: Array, draw: Draw) -> InitialState:
+        """At rest before the first gate, the nose towards it."""
+        offset = self.offset(draw)
+        track = draw.openings + 0.0 * offset[..., None, :1]
+        self.memory.track = track
+        c, s = track[..., 0, 3], track[..., 0, 4]
+        behind = _BEHIND * self.config.scene.scale
+        position = track[..., 0, :3] - behind * stack((c, s, 0.0 * c)) + offset
+        w = square_root((1.0 + c) / 2)  # the first gate faces left of the ring: c > -0.5
+        return self.start(position, stack((w, 0.0 * c, 0.0 * c, s / (2 * w))))

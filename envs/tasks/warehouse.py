@@ -1,0 +1,110 @@
+"""`rotorgram/Warehouse-v0`: to a goal behind rows of racks whose aisles may be closed."""
+
+from collections.abc import Mapping
+from typing import Annotated, ClassVar
+
+import numpy as np
+
+from ...models import InputError
+from ...models.fields import Limits, NumberOrPair, immutable
+from ...scenes import SceneConfig
+from ...scenes.aisles import AISLE, DEPTH, PASSAGE, ROW, counts
+from ...sim import Array, Draw, InitialState, parts_of
+from .forest import Forest, distance_of
+from .task import TaskOptions
+
+
+@immutable
+class WarehouseOptions(TaskOptions):
+    """Options of `rotorgram/Warehouse-v0`."""
+
+    speed: Annotated[float | tuple[float, float], NumberOrPair(Limits(0.3, 5.0, "m/s"))] = 1.5
+    """Wanted speed, m/s; of a pair, each episode draws one between."""
+    rows: Annotated[int, Limits(1, 8, whole=True)] = 2
+    """Of racks, one after the other."""
+    aisles: Annotated[int, Limits(2, 8, whole=True)] = 3
+    """Through each row; all but one are closed at their far end."""
+
+
+class Warehouse(Forest):
+    """Fly to a goal behind rows of racks. One aisle of each row leads through it.
+
+    The others end after 2.4 m, which the craft sees no sooner than from within, for its sensor
+    reaches 2 m. Back before the row, a closed aisle looks as an open one: who does not remember
+    which aisles were tried enters the same one again.
+
+    ## Observation
+
+    That of `Forest-v0`, without `depth`. `tof`, `float32`, shape (8, 8): a VL53L5CX, which looks
+    45° ahead, up to 2 m. The option `sensors` takes others.
+
+    ## Action
+
+    By the option `action`; with `velocity` velocity and yaw rate.
+
+    ## Reward
+
+    That of `Forest-v0`. The way to the goal leads through the open aisles; only the reward knows
+    which they are. In a closed aisle it leads back first.
+
+    ## Start, termination, truncation
+
+    At rest, level, looking at the goal, 0.9 m to 1.3 m high.
+
+    *Terminated*: within 0.5 m of the goal in the plane and in height; by contact; a tilt above 90°;
+    or higher than 2 m. *Truncated*: after 800 steps of 0.05 s.
+    """
+
+    Options = WarehouseOptions
+    heights = (0.9, 1.3)
+    ceiling = 2.0
+    reached = 0.5
+    episode_length = 800
+    defaults: ClassVar[Mapping[str, object]] = {
+        "vehicle": ("crazyflie2",),
+        "sensors": {"tof": {"model": "vl53l5cx", "reach": 2.0}},
+    }
+
+    @classmethod
+    def scene(cls, options: WarehouseOptions) -> SceneConfig:
+        """New aisles in each episode."""
+        size = ROW - DEPTH + ROW * options.rows, AISLE * options.aisles
+        return SceneConfig(name="aisles", layouts="new", size=size)
+
+    def setup(self) -> None:
+        """See the class."""
+        scene = self.config.scene
+        if scene.name != "aisles":
+            raise InputError(f"scene: expected aisles with {self.config.env_id}, got {scene}")
+        rows, aisles = counts(scene)
+        self.define_way(ROW * rows, AISLE * aisles)
+
+    def begin(self, mask: Array, draw: Draw) -> InitialState:
+        """Before the first row, looking at the goal."""
+        start = super().begin(mask, draw)
+        memory = self.memory
+        # x and y of the middles of the open aisles, m.
+        memory.doors = draw.openings[..., :2] + 0.0 * start.position[..., None, :1]
+        memory.way = self.way(start.position)
+        return start
+
+    def way(self, position: Array) -> Array:
+        """Through the open aisles that are ahead, m, (W, A).
+
+        From before a row it leads to its open aisle, along that, and on. From a closed aisle it
+        leads back to its mouth first.
+        """
+        x, y, _ = parts_of(position)
+        way = distance_of(self._half - x, y)
+        last_x, last_y, left = self._half + 0.0 * x, 0.0 * y, 0.0 * x
+        for row in reversed(range(counts(self.config.scene)[0])):
+            middle, door = parts_of(self.memory.doors[..., row, :])
+            mouth, end = middle - DEPTH / 2, middle + DEPTH / 2
+            left = left + distance_of(last_x - end, last_y - door)
+            inside = end - x + left
+            back = x - mouth + abs(y - door) + DEPTH + left
+            within = np.where(abs(y - door) < PASSAGE / 2, inside, back)
+            before = distance_of(mouth - x, y - door) + DEPTH + left
+            way = np.where(x < mouth, before, np.where(x < end, within, way))
+            last_x, last_y, left = mouth, door, left + DEPTH
+        return way

@@ -1,0 +1,38 @@
+"""Landing and tracking among trees: starts and goals are clear, or the scene is refused."""
+
+import numpy as np
+import pytest
+from contracts import loop_of
+from rotorgram.models import InputError
+from rotorgram.scenes import Solids
+
+from flights import task_of
+
+TASKS = ["rotorgram/Landing-v0", "rotorgram/Tracking-v0"]
+
+
+@pytest.mark.parametrize("env_id", TASKS)
+def test_starts_and_goals_are_clear_of_trees(env_id: str) -> None:
+    loop = loop_of(env_id, 6, backend="rigid", scene="forest:new,density=0.2,size=40x40")
+    loop.advance(np.zeros((6, 4)), np.ones(6, bool), list(range(6)))
+    radius = loop.spec.constants["radius"]
+    for world, seed in enumerate(loop.world.scenery.seeds.tolist()):
+        solids = Solids.of_layout(loop.config.scene, seed)
+        assert len(solids) > 320
+        for name in ("position", "goal"):
+            assert solids.distance(loop.telemetry[name][world]) > radius
+    loop.close()
+
+
+@pytest.mark.parametrize("env_id", TASKS)
+def test_a_scene_without_room_is_refused(env_id: str) -> None:
+    with pytest.raises(InputError, match=f"scene: expected one that leaves .* to {env_id}, got"):
+        task_of(env_id, scene="forest:new,density=0.2,size=40x40,clear=ends")
+    with pytest.raises(InputError, match="got aisles, which leaves 0"):
+        task_of(env_id, scene="aisles")
+
+
+def test_a_wide_path_needs_a_wide_scene() -> None:
+    with pytest.raises(InputError, match=r"leaves .* got gates:new, which leaves 8"):
+        task_of("rotorgram/Tracking-v0", scene="gates:new", radius=9.0)
+    task_of("rotorgram/Tracking-v0", radius=9.0)
