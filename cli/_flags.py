@@ -17,7 +17,6 @@ from tyro.constructors import PrimitiveConstructorSpec
 from ..models import Backend
 from ..models.errors import InputError, shortened
 from ..models.fields import PositiveInt, immutable
-from ..scenes import SceneConfig
 
 if TYPE_CHECKING:
     from ..envs.config import EnvConfig
@@ -139,6 +138,8 @@ class EnvFlags(Command):
     @property
     def shown_scene(self) -> str | None:
         """The scene that the user wants to see, if it is a single one."""
+        from ..scenes import SceneConfig
+
         scene = self.options.get("scene")
         return str(scene) if scene and len(SceneConfig.parse(scene).given_scenes) == 1 else None
 

@@ -4,7 +4,7 @@ import logging
 import time
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, cast
 
 import numpy as np
 
@@ -32,8 +32,7 @@ class Watcher:
 
     def __init__(self, live: LiveView, simulator: Simulator) -> None:
         self._live: LiveView | None = live
-        assert isinstance(simulator.stepped, Loop)  # the command flies registered tasks alone
-        self._loop = simulator.stepped
+        self._loop = cast(Loop, simulator.stepped)  # the command flies registered tasks alone
         self._steps = np.zeros(live.stage.drones, np.int64)
         self._episodes = np.zeros(live.stage.drones, np.int64)
 

@@ -9,9 +9,10 @@ from tyro.conf import Positional
 
 from ..flights.palette import agent_label
 from ..flights.recorded import recorded_trajectories
-from ..flights.trajectories import RANGES, flown_trajectories
+from ..flights.trajectories import flown_trajectories
 from ..models import InputError
 from ..models.fields import NonNegativeInt
+from ..scenes.returns import RANGES
 from ._flags import Count, EnvFlags, OneOrMore, Words
 
 if TYPE_CHECKING:

@@ -8,8 +8,9 @@ from pathlib import Path
 from tyro.conf import Positional
 
 from ..flights.recorded import recorded_trajectories
-from ..flights.trajectories import RANGES, flown_trajectories
+from ..flights.trajectories import flown_trajectories
 from ..models import InputError
+from ..scenes.returns import RANGES
 from ._flags import Count, EnvFlags
 
 

@@ -133,7 +133,7 @@ def moments(loop: "Loop", episodes: Sequence[int]) -> "list[Moment]":
     return found
 
 
-def moment(spec: EnvSpec, telemetry: Mapping[str, Any], *, step: int, **rest: Any) -> "Moment":
+def moment(spec: EnvSpec, telemetry: Mapping[str, Any], *, step: int = 0, **rest: Any) -> "Moment":
     """The `Moment` of one drone, with `step`, `reward`, `episode` and `readings` as `Moment` has
     them.
 

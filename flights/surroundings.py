@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ..scenes import SceneConfig, Solids
-from .trajectories import Trajectory
+from .trajectories import Floats, Trajectory
 
 _SIDE = 40.0
 """Width of the square about the z axis that counts of a scene without a size, m."""
@@ -50,12 +50,20 @@ def _measured(flight: Trajectory) -> tuple[float, ...]:
     radius = flight.spec.constant("radius", "evaluate")
     position = flight.telemetry["position"]
     speed = np.linalg.norm(flight.telemetry["velocity"], axis=1)
-    clearance = solids.distance(position) - radius
+    clearance = _distances(solids, position, flight.spec.control_period) - radius
     ends_near = clearance[-1] < speed[-2:].max() * flight.spec.control_period
     mean = speed[1:].mean() if len(flight) else 0.0
     hard = _traversability(solids, scene, radius, position[0, 2])
     touched = float(flight.terminated and ends_near)
     return touched, flight.seconds, mean, speed.max(), clearance.min(), hard
+
+
+def _distances(solids: Solids, position: Floats, period: float) -> Floats:
+    """Of a flight to the nearest solid after each control step, m."""
+    if not solids.moves.any():
+        return solids.distance(position)
+    now = [solids.at(step * period).distance(place) for step, place in enumerate(position)]
+    return np.array(now)
 
 
 def _traversability(solids: Solids, scene: SceneConfig, radius: float, height: float) -> float:

@@ -9,7 +9,7 @@ from collections.abc import Collection, Iterable, Mapping, Sequence
 from contextlib import closing
 from dataclasses import field
 from functools import cached_property
-from typing import Literal, get_args
+from typing import TYPE_CHECKING, Literal, get_args
 
 import numpy as np
 from gymnasium.vector.utils import iterate
@@ -23,14 +23,12 @@ from ..envs.spec import EnvSpec
 from ..models import InputError
 from ..models.fields import immutable
 from ..scenes import SceneConfig
-from ..scenes.returns import Reading
-from ..sim.sensors import range_sensors_of
-from ..sim.sensors.range_sensors import KINDS, RangeSensor
+from ..scenes.returns import RANGES, Reading
+
+if TYPE_CHECKING:
+    from ..sim.sensors.range_sensors import RangeSensor
 
 Floats = NDArray[np.float64]
-
-RANGES = KINDS
-"""Observations of sensors with rays."""
 
 _EVALUATION = 20230324  # the day the paper appeared
 
@@ -106,10 +104,12 @@ class Trajectory:
         return EnvConfig.from_keywords(spec.env_id, **spec.options)
 
     @cached_property
-    def _range_sensors(self) -> list[RangeSensor]:
+    def _range_sensors(self) -> "list[RangeSensor]":
         """Sensors with rays that are among the observations."""
         if self.config is None:
             return []
+        from ..sim.sensors import range_sensors_of  # which imports MuJoCo
+
         sensors = range_sensors_of(self.config.sensors, self.spec.control_period)
         return [sensor for sensor in sensors if sensor.name in self.observations]
 
@@ -300,14 +300,13 @@ def flown_trajectories(
     training_seed: int | None = None,
     observations: Collection[str] = RANGES,
 ) -> Flights:
-    """Evaluation episodes of a set by number, flown in process as by `fly_episodes`, in unseen
-    layouts of a scene; with the readings of sensors with rays."""
+    """Evaluation episodes of a set by number, flown in process as by `fly_episodes`; with the
+    readings of sensors with rays.
+    """
     from ..envs.vector import LocalVectorEnv  # which imports MuJoCo
 
     found: Flights = []
-    with closing(
-        LocalVectorEnv(config.unseen(), config.drones, autoreset_mode="Disabled")
-    ) as world:
+    with closing(LocalVectorEnv(config, config.drones, autoreset_mode="Disabled")) as world:
         for episode in episodes:
             found += fly_episodes(world, policy, 1, of, episode, training_seed, observations)
     return found

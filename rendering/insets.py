@@ -23,6 +23,8 @@ def add_insets(picture: Picture, moment: Moment) -> None:
     height, width, _ = picture.shape
     top = _GAP
     for reading in moment.readings:
+        if top >= height:
+            break
         reach = reading.reach
         view = range_colors(reading.distances, reach)
         if not reading.is_flat:

@@ -13,6 +13,8 @@ import numpy as np
 
 from .kernels import Array, Function, Options, _least, _pick
 
+RANGES = ("depth", "lidar", "tof")
+"""Kinds of sensors with rays, and their names among observations."""
 LEVELS = 4096
 """How many values a normal number has here: those in the middle of as many equal shares."""
 SHARES = 1 << 20

@@ -19,7 +19,7 @@ from PIL import Image, ImageDraw, ImageFont
 from rotorgram.cli import main as rotorgram
 from rotorgram.models import QUAD_XML
 from rotorgram.rendering.gl import Offscreen
-from rotorgram.scenes import SCENES, SEEDED_SCENES, build_scene
+from rotorgram.scenes import SCENES, build_scene, seeded_scenes
 
 WIDTH, HEIGHT = 480, 300  # of a scene of the gallery
 COLUMNS = 3
@@ -28,6 +28,9 @@ VIEWS = {  # of a scene: where the camera looks, its distance, azimuth and eleva
     "airport": ((60.0, 20.0, 0.0), 150.0, 40.0, -16.0),
     "Forest-v0": ((0.0, 0.0, 2.0), 44.0, 62.0, -24.0),
     "warehouse": ((0.0, 0.0, 4.0), 34.0, 35.0, -22.0),
+    "aisles": ((0.0, 0.0, 0.5), 14.0, 40.0, -35.0),
+    "maze": ((0.0, 0.0, 1.0), 52.0, 40.0, -40.0),
+    "traffic": ((0.0, 0.0, 2.0), 20.0, 40.0, -22.0),
 }
 USUAL = ((0.0, 0.0, 3.0), 46.0, 40.0, -22.0)
 FILM = "split[a][b];[a]palettegen=max_colors=64[p];[b][p]paletteuse=dither=none"
@@ -56,7 +59,7 @@ def scene_picture(name: str, scene: str) -> Image.Image:
 
 def gallery(out: Path) -> None:
     """Every scene, and the wood of `Forest-v0`, in rows of three."""
-    scenes = {name: f"{name}:3" if name in SEEDED_SCENES else name for name in SCENES}
+    scenes = {name: f"{name}:3" if name in seeded_scenes() else name for name in SCENES}
     scenes["Forest-v0"] = "forest:3,density=0.1,size=34x16,clear=ends"
     rows = -(-len(scenes) // COLUMNS)
     whole = Image.new("RGB", (COLUMNS * WIDTH, rows * HEIGHT), "white")

@@ -47,6 +47,6 @@ def film_study(results: Results, out: Path, tell: Tell = lambda *_: None) -> Non
         else:
             policy = load(checkpoint_file(results.folder, row, seed)).policy()
             name += f", seed {seed}"
-        flown = flown_trajectories(policy, row.env, [0], results.study.evaluation, seed)
+        flown = flown_trajectories(policy, row.env.unseen(), [0], results.study.evaluation, seed)
         tracks.append(FilmTrack(name=name, trajectories=flown, drones=env.drones))
     film(out, tracks, config, tell)

@@ -66,9 +66,7 @@ class Dodge(Hover):
     episode_length = 300
     defaults: ClassVar[Mapping[str, Any]] = {
         "vehicle": ("hummingbird",),
-        "sensors": {
-            "lidar": {"model": "os0", "rows": 8, "columns": 36, "low": -30.0, "high": 30.0}
-        },
+        "sensors": {"lidar": _LIDAR},
     }
     metrics = (
         Metric(name="success", unit="", goal="high", held=0.5, final=True),

@@ -21,6 +21,7 @@ from ...sim import (
     parts_of,
     square_root,
     stack,
+    total,
 )
 from ..spec import Metric
 from ..state import State
@@ -188,7 +189,7 @@ class Forest(Task):
         memory.progress = memory.way - way
         memory.way = way
         change = state.action - memory.last
-        memory.change = (change * change).sum(axis=-1)
+        memory.change = total(change * change)
         memory.last = 1.0 * state.action
         speed = length(state.velocity)
         memory.path = memory.path + speed * self.control_period

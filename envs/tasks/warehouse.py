@@ -77,6 +77,8 @@ class Warehouse(Forest):
         if scene.name != "aisles":
             raise InputError(f"scene: expected aisles with {self.config.env_id}, got {scene}")
         rows, aisles = counts(scene)
+        if not rows * aisles:
+            raise InputError(f"scene: expected a row of racks with an aisle, got {scene}")
         self.define_way(ROW * rows, AISLE * aisles)
 
     def begin(self, mask: Array, draw: Draw) -> InitialState:

@@ -17,7 +17,7 @@ from ...models.files import read_own_toml
 from ...scenes import Layouts, Rays
 from ...scenes import returns as kernels
 from ...scenes.rays import MAX_PLACE, MAX_REACH
-from ...scenes.returns import ErrorModel, Reading
+from ...scenes.returns import RANGES, ErrorModel, Reading
 from ..random import words_of
 from ..rotations import to_world
 from ..state import Array, ByName, clip
@@ -55,7 +55,7 @@ _DEFAULTS = {
 }  # fmt: skip
 _KINDS = {"depth": ("rows", "columns", "fov"), "lidar": ("rows", "columns", "low", "high")}
 _KINDS["tof"] = _KINDS["depth"]
-KINDS = tuple(_KINDS)
+KINDS = RANGES
 """In this order they are observed."""
 
 

@@ -102,7 +102,7 @@ def test_trees_leave_room_at_start_and_goal_and_have_their_density() -> None:
 
 def test_policies_are_tried_in_unseen_layouts() -> None:
     config = EnvConfig.from_keywords(FOREST, backend="rigid", episode_length=3)
-    (flown,) = flown_trajectories(None, config, [0])
+    (flown,) = flown_trajectories(None, config.unseen(), [0])
     assert flown.spec.config_digest == config.unseen().digest != config.digest
     layout = int(flown.telemetry["layout"][0, 0])
     assert layout % 2 == 1

@@ -142,7 +142,7 @@ def test_cameras_see_its_objects(opengl: None, scene: str) -> None:
         cameras.take(due, {"position": place, "quaternion": turn})
         seen = np.unique(cameras.pictures["front_segmentation"])
         objects = [cameras.objects[i] for i in seen]
-        least = 2 if scene == "traffic" else 5
+        least = 5 if scene in OPEN_SCENES else 2
         assert sum(one.startswith(f"{scene}/") for one in objects) >= least
 
 

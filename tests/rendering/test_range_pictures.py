@@ -198,3 +198,17 @@ def test_a_journal_gives_the_observations_that_are_wanted(tmp_path: Path) -> Non
     np.testing.assert_array_equal(wanted.observations["depth"], seen)
     np.testing.assert_array_equal(wanted.readings(2)[0].distances, seen[2])
     assert list(wanted.observations) == ["depth"]
+
+
+def test_insets_stop_at_the_lower_edge_of_a_small_picture() -> None:
+    loop = Loop(
+        EnvConfig.from_keywords(
+            "rotorgram/Forest-v0", backend="rigid", sensors={"lidar": True, "tof": True}
+        )
+    )
+    loop.advance(np.zeros((1, 4), np.float32), np.ones(1, bool), [0])
+    (moment,) = moments_now(loop, [0])
+    for size in ((16, 16), (64, 64), (90, 160)):
+        picture = np.zeros((*size, 3), np.uint8)
+        add_insets(picture, moment)
+        assert picture.any()
