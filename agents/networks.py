@@ -37,7 +37,10 @@ class Network(Chain):
         layers: list[Layer] = []
         if distances := distances_in(arrays):
             layers.append(Nearness(distances))
-        if self.convolves and any(map(is_grid, arrays)):
+        if self.convolves:
+            if not any(map(is_grid, arrays)):
+                names = ", ".join(array.name for array in arrays)
+                raise InputError(f"network: expected rays in rows or rings for cnn, got {names}")
             encoder = Encoder(arrays, config.filters, _ACTIVATIONS[config.activation])
             inputs = encoder.outputs
             layers.append(encoder)

@@ -64,8 +64,8 @@ class Vfh:
     nearest one of a sector takes the place of a sum over the cells of a grid.
 
     The observation has to have the numbers of `Forest-v0` and a lidar of one ring. Loops beneath
-    the level `velocity` fly it: they are those of `geometric`. It has a state for each of N drones
-    whose observations are given together. Raises `InputError` for an env that lacks what it needs.
+    the level `velocity` fly it: they are those of `geometric`. It keeps one state per drone of a
+    batch. Raises `InputError` for an env that lacks what it needs.
     """
 
     label = "VFH+"

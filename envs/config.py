@@ -165,7 +165,7 @@ class EnvConfig:
             chosen = task.Options.from_options(options, KEYWORDS)
             options = chosen.to_options()
             usual = task.scene(chosen)
-        scene = usual if self.scene is None else SceneConfig.parse(self.scene)
+        scene = usual if self.scene is None else SceneConfig.parse(self.scene).filled(usual)
         set_fields(self, task=json_values(options), scene=scene)
 
     # ---- other forms

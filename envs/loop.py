@@ -139,7 +139,7 @@ class Loop:
         self._measure()
 
     def _move_solids(self, steps: Array) -> None:
-        """Solids that move go to where they are after so many steps of each episode, (W, A)."""
+        """Move solids to their places after so many control steps of each episode, (W, A)."""
         scenery = self._world.scenery
         if scenery.moves:
             scenery.move(steps >= 0, self._task.control_period * steps[:, 0])

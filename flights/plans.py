@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from ..models.errors import InputError
 from ..scenes.solids import Solids
 from .trajectories import Trajectory, common_scene
 
@@ -21,13 +22,15 @@ def drawn_plan(flights: Mapping[str, Trajectory]) -> "Figure":
 
     Solids are cut at the median height of the paths. A cross is where a flight was terminated
     within the craft's radius of a solid or of the ground. Raises `InputError`: the flights have
-    different layouts, or no position.
+    different layouts, or one whose solids move, or no position.
     """
     from matplotlib.figure import Figure
 
     flown = list(flights.values())
     scene = common_scene(flight.scene for flight in flown)
     solids = Solids.of_scene(scene)
+    if solids.moves.any():
+        raise InputError(f"plan: expected a scene whose solids stand still, got {scene}")
     constants = flown[0].spec.constants
     period = flown[0].spec.control_period
     paths = [flight.pose[:, :3] for flight in flown]

@@ -5,6 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from ..models import InputError
 from ..scenes import SceneConfig, Solids
 from .trajectories import Floats, Trajectory
 
@@ -16,7 +17,7 @@ class Passage(NamedTuple):
     """Means over the flights of an evaluation in a scene."""
 
     touched: float
-    """Share of the flights that ended at a solid: nearer than a control step leads."""
+    """Share of the flights that terminated within the way of one control step of a solid."""
     time: float
     """s"""
     mean_speed: float
@@ -30,8 +31,13 @@ class Passage(NamedTuple):
 
     @classmethod
     def of(cls, flights: Sequence[Trajectory]) -> "Passage | None":
-        """None where there are no solids, or the telemetry lacks position or velocity."""
-        rows = [_measured(one) for one in flights if one.telemetry.keys() >= _NEEDED]
+        """None where there are no solids, or they are not known here, or the telemetry lacks
+        position or velocity.
+        """
+        try:
+            rows = [_measured(one) for one in flights if one.telemetry.keys() >= _NEEDED]
+        except InputError:  # the scene's file is elsewhere
+            return None
         known = np.array([row for row in rows if row])
         if not known.size:
             return None

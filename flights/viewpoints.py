@@ -36,7 +36,7 @@ class CaptureConfig:
     vehicle: str | None = None
     """File or name of the vehicle that flew. Default: the paper's."""
     scene: str = "plain"
-    """Surroundings: plain, airport, or forest:SEED, warehouse:SEED, gates:SEED."""
+    """Surroundings: plain, airport, or a TOML or MJCF file, or one from a seed, as forest:3."""
     every: PositiveInt = 10
     """Control steps from one frame to the next."""
     aside: Annotated[float, Limits(0, 1e4, "m")] = 0.0

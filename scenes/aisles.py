@@ -24,7 +24,7 @@ def counts(scene: "SceneConfig") -> tuple[int, int]:
 
 
 def most_of_aisles(scene: "SceneConfig") -> int:
-    """At least as many as any layout has parts."""
+    """Upper bound of the number of parts of a layout."""
     rows, count = counts(scene)
     return 2 * rows * count + rows + 8
 

@@ -39,10 +39,10 @@ class SceneConfig:
     seeds: Annotated[
         tuple[int, ...], Limits(0, 2 * NEW_SEEDS - 1, whole=True, count=0, least=0)
     ] = ()
-    """Of layouts: of several, each episode draws one. None given: seed 0."""
+    """Seeds of layouts. Each episode draws one of them. Empty means seed 0."""
     layouts: Literal["given", "new", "unseen"] = "given"
     """`given`: those of `seeds`. `new`: each episode of each world draws a layout of its own.
-    `unseen`: the same, of layouts that `new` never has, for tests of what was learned."""
+    `unseen`: the same, of layouts that `new` never draws, for evaluation."""
     density: Annotated[float | None, Limits(1e-4, 0.5, "1/m²")] = None
     """Trees per square metre of a forest."""
     size: Annotated[tuple[float, float] | None, Limits(4.0, 400.0, "m", count=2)] = None
@@ -166,6 +166,14 @@ class SceneConfig:
     def with_seed(self, seed: int) -> "SceneConfig":
         """The scene of one seed."""
         return replace(self, seeds=(seed,), layouts="given") if self.is_seeded else self
+
+    def filled(self, usual: "SceneConfig") -> "SceneConfig":
+        """The same; without options of its own it has those of another scene of its name."""
+        if self.name != usual.name or self != replace(
+            self, density=None, size=None, clear="middle"
+        ):
+            return self
+        return replace(self, density=usual.density, size=usual.size, clear=usual.clear)
 
     def unseen(self) -> "SceneConfig":
         """The same for tests: unseen layouts in place of new ones."""

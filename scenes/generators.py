@@ -88,7 +88,7 @@ class Draft:
         return [f"{name}_{one}" for one in self.rng.integers(colours, size=count).tolist()]
 
     def around(self, reach: float, far: float) -> tuple[float, float]:
-        """A place up to `far` from which `reach` does not lead into the clear space."""
+        """A place up to `far`, whose circle of radius `reach` does not touch the clear space."""
         while True:
             x, y = self.rng.uniform(-far, far, 2).tolist()
             if max(abs(x), abs(y)) > CLEARANCE + reach:
@@ -190,7 +190,7 @@ def _add_crowns(
 
 
 def _places(wood: Draft, reach: Array) -> Array:
-    """Places in the wood from which `reach` does not lead into its clear spaces, (n, 2)."""
+    """Places in the wood, (n, 2), whose circles of radius `reach` touch no clear space."""
     half = np.array(wood.scene.size or FOREST_SIZE) / 2
     places = np.empty((len(reach), 2))
     left = np.arange(len(reach))
@@ -301,7 +301,7 @@ def _add_gate(track: Draft, number: int) -> None:
 
 
 def _most_of_forest(scene: SceneConfig) -> int:
-    """At least as many as any forest of this density and size has primitives."""
+    """Upper bound of the number of parts of a forest."""
     wide, deep = scene.size or FOREST_SIZE
     return 4 * scene.trees + round(wide * deep * (_SHRUB_DENSITY + _ROCK_DENSITY)) + 8
 

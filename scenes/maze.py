@@ -27,7 +27,7 @@ _ENDS = 2.0  # m: radius of the clear spaces at the ends
 
 
 def most_walls(scene: "SceneConfig") -> int:
-    """At least as many as any maze of this size has parts."""
+    """Upper bound of the number of parts of a maze."""
     columns, rows = _cells(scene)
     return columns * rows + 5
 

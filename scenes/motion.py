@@ -37,10 +37,10 @@ def offsets(motions: Array, time: Array) -> Array:
     (..., N, 3). The bits are the same on every processor.
     """
     velocity, start, first, second, rate = np.split(motions, (3, 4, 7, 10), axis=-1)
-    moment = time[..., None]
-    angle = rate * moment
+    seconds = time[..., None]
+    angle = rate * seconds
     moved: Array = (settled(np.cos(angle)) - 1) * first + settled(np.sin(angle)) * second
-    since = np.maximum(moment - start, 0.0)
+    since = np.maximum(seconds - start, 0.0)
     is_thrown = velocity.any(axis=-1)
     moved += velocity * since
     moved[..., 2] -= np.where(is_thrown, GRAVITY / 2 * (since * since)[..., 0], 0.0)

@@ -28,9 +28,9 @@ class SceneType:
     materials: Mapping[str, Any] = field(default_factory=dict)
     """Looks by name, as in `materials.toml`."""
     most: "Callable[[SceneConfig], int]" = lambda _: MAX_DRAWN
-    """At least as many as any layout has parts."""
+    """Upper bound of the number of parts of a layout."""
     room: float = CLEARANCE
-    """Half the width of the space about the z axis, 20 m high, that only gates enter, m."""
+    """Half the width of the square about the z axis that a layout keeps free up to 20 m, m."""
     options: tuple[str, ...] = ()
     """Which of `density`, `size` and `clear` it has."""
 

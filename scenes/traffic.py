@@ -43,5 +43,5 @@ def traffic(field: "Draft") -> None:
 
 
 def most_of_traffic(_: "SceneConfig") -> int:
-    """All of them, and the ground."""
+    """Balls, posts and the ground."""
     return _BALLS + _POSTS + 1

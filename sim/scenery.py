@@ -31,9 +31,9 @@ class Scenery(Kept):
         which: Number of each world's layout, shape (W,).
         moves: Whether solids move.
         rows: Of each world's layout how many primitives it has, and the addresses of their kinds
-            and of their table, uint64, shape (W, 3); variables in code that is being compiled.
-        openings: Of each world's layout, as of `generators.openings_of`, shape (W, K, 6); variables
-            too.
+            and of their table, uint64, shape (W, 3); traced while code is compiled.
+        openings: Of each world's layout, as of `generators.openings_of`, shape (W, K, 6); traced
+            likewise.
     """
 
     arrays = ("seeds",)
@@ -47,9 +47,8 @@ class Scenery(Kept):
         self._always = Solids.ground() + own
         laid = [self._always + self.solids(seed) for seed in self._given.tolist()]
         self.layouts = Layouts.of(*laid)
-        found = [openings_of(scene, seed) for seed in self._given.tolist() or [0]]
-        self._openings = np.array(found)
-        self.openings: Array = np.zeros((worlds, *found[0].shape))
+        self.openings: Array = np.zeros((worlds, *openings_of(scene, 0).shape))
+        self._openings = np.array([self._opened(seed) for seed in self._given.tolist()])
         self.moves = bool(self.solids(0).moves.any())
         if self.moves:  # each world has a time of its own
             most = self.most
@@ -102,7 +101,7 @@ class Scenery(Kept):
         self.move(mask, np.zeros(len(mask)))
 
     def take(self, seeds: Array) -> None:
-        """Give worlds the layouts of such seeds, shape (W,)."""
+        """Give worlds the layouts of these seeds, shape (W,)."""
         old, self.seeds = self.seeds, seeds
         if is_traced(seeds):
             return
@@ -182,11 +181,19 @@ class Scenery(Kept):
             self.which = np.arange(count)
         for world, solids in made.items():
             self.layouts.put(world, self._always, solids)
-            self.openings[world] = openings_of(self.scene, int(self.seeds[world]))
+            self.openings[world] = self._opened(int(self.seeds[world]))
             if self.moves:
                 self._motions[world, : len(solids)] = solids.motions
                 self._motions[world, len(solids) :] = REST
                 self._places[world] = self.centers[world].T
+
+    def _opened(self, seed: int) -> Array:
+        """Openings of a layout. Raises `InputError` unless there are as many as in all others."""
+        found = openings_of(self.scene, seed)
+        if found.shape != self.openings.shape[1:]:
+            expected = f"{self.openings.shape[1]} openings in each layout of {self.scene.name}"
+            raise InputError(f"scene: expected {expected}, got {len(found)}")
+        return found
 
     @property
     def centers(self) -> Array:

@@ -14,8 +14,7 @@ import numpy as np
 from ...models.errors import InputError
 from ...models.fields import Choice, Limits, Rule, check, check_names
 from ...models.files import read_own_toml
-from ...scenes import Layouts, Rays
-from ...scenes import returns as kernels
+from ...scenes import Layouts, Rays, returns
 from ...scenes.rays import MAX_PLACE, MAX_REACH
 from ...scenes.returns import RANGES, ErrorModel, Reading
 from ..random import words_of
@@ -170,8 +169,8 @@ class RangeSensor(Instrument):
         flat = ranges.reshape(len(place), -1)
         words = self._words(moment, due, chosen, flat.shape)
         read = np.empty_like(flat)
-        code = kernels.compiled()
-        run = code.readings if code else kernels.by_numpy
+        code = returns.compiled()
+        run = code.readings if code else returns.by_numpy
         run(flat, self._scale, self._neighbours, words, self.errors.numbers(), read)
         out[chosen] = read.reshape(out[chosen].shape)
         return out
@@ -179,13 +178,13 @@ class RangeSensor(Instrument):
     def _words(self, moment: Moment, due: Array, chosen: Any, shape: tuple[int, int]) -> Array:
         """Random words of each ray of the drones that are due."""
         if not self.errors.draws:
-            return np.full(shape, kernels.CALM, np.uint32)
+            return np.full(shape, returns.CALM, np.uint32)
         worlds, drones = due.shape
         size = -(-shape[1] // 4) * 4
         rows = worlds * drones
         words = np.empty((worlds, drones * size), np.uint32)
         steps = moment.steps[:, 0].astype(np.uint32)
-        code = kernels.compiled()
+        code = returns.compiled()
         keys = np.ascontiguousarray(moment.keys)
         if code:
             code.words(keys, np.uint64(self._use), moment.episode, steps, words)

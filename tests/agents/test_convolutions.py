@@ -9,6 +9,7 @@ from rotorgram.agents.layers import Weights
 from rotorgram.agents.networks import CNN, MLP, Network
 from rotorgram.envs import LocalVectorEnv
 from rotorgram.envs.spec import IMAGE, RINGS, ArraySpec, SpecError
+from rotorgram.models import InputError
 from torch import Tensor
 from torch.nn import functional
 
@@ -123,12 +124,11 @@ def test_a_ring_that_turns_turns_what_is_seen() -> None:
     assert np.ptp(plain) > 0.1
 
 
-def test_an_mlp_takes_images_flat_and_a_cnn_of_plain_arrays_is_an_mlp() -> None:
+def test_an_mlp_takes_images_flat_and_a_cnn_of_plain_arrays_is_refused() -> None:
     mlp, _ = network_of(MLP)
     assert mlp.shapes["layers.0.weight"] == (7, 91)
-    plain = CNN([PLAIN, AFTER], 2, SMALL)
-    assert plain.shapes == MLP([PLAIN, AFTER], 2, SMALL).shapes
-    assert len(plain.layers) == len(MLP([PLAIN, AFTER], 2, SMALL).layers)
+    with pytest.raises(InputError, match="network: expected rays in rows or rings for cnn, got"):
+        CNN([PLAIN, AFTER], 2, SMALL)
 
 
 @pytest.mark.parametrize(

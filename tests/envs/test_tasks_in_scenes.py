@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from contracts import loop_of
+from rotorgram.envs.config import EnvConfig
 from rotorgram.models import InputError
 from rotorgram.scenes import Solids
 
@@ -36,3 +37,17 @@ def test_a_wide_path_needs_a_wide_scene() -> None:
     with pytest.raises(InputError, match=r"leaves .* got gates:new, which leaves 8"):
         task_of("rotorgram/Tracking-v0", scene="gates:new", radius=9.0)
     task_of("rotorgram/Tracking-v0", radius=9.0)
+
+
+def test_a_scene_without_options_has_those_of_the_task() -> None:
+    of_task = {
+        "Forest": ({"density": 0.2}, "forest:3", "forest:3,density=0.2,size=34x16,clear=ends"),
+        "Gates": ({"opening": 1.2}, "gates:0-3", "gates:0-3,size=12x12"),
+        "Hover": ({}, "forest:3", "forest:3"),
+    }
+    for name, (options, given, expected) in of_task.items():
+        config = EnvConfig.from_keywords(f"rotorgram/{name}-v0", scene=given, **options)
+        assert str(config.scene) == expected
+        assert EnvConfig.from_keywords(**config.keywords()) == config
+    own = "forest:3,density=0.05,size=40x20,clear=ends"
+    assert str(EnvConfig.from_keywords("rotorgram/Forest-v0", scene=own).scene) == own

@@ -11,7 +11,7 @@ from rotorgram.cli import main
 from rotorgram.envs.config import EnvConfig
 from rotorgram.envs.registry import env_spec
 from rotorgram.flights.plans import drawn_plan
-from rotorgram.flights.trajectories import Trajectory
+from rotorgram.flights.trajectories import Trajectory, flown_trajectories
 from rotorgram.models import InputError
 from rotorgram.scenes import Solids
 from rotorgram.udp.spawn import spawn_simulator
@@ -101,3 +101,10 @@ def test_a_recorded_flight_gives_a_plan(tmp_path: Path, capsys: pytest.CaptureFi
     words = {element.text for element in ElementTree.parse(out).iter() if element.text}
     assert {"start", "goal", "touched", "speed (m/s)", "x (m)", "y (m)"} <= words
     assert "plan.svg" in capsys.readouterr().out
+
+
+def test_a_plan_of_solids_that_move_is_refused() -> None:
+    config = EnvConfig.from_keywords("rotorgram/Dodge-v0", backend="rigid", episode_length=3)
+    flights = flown_trajectories(None, config, [0])
+    with pytest.raises(InputError, match="plan: expected a scene whose solids stand still, got tr"):
+        drawn_plan({"one": flights[0]})

@@ -9,10 +9,21 @@ import pytest
 from rotorgram.envs import Loop
 from rotorgram.envs.config import EnvConfig
 from rotorgram.models.cameras import chosen_views
+from rotorgram.models.errors import InputError
 from rotorgram.models.vehicle import Vehicle
 from rotorgram.rendering.cameras import Cameras
-from rotorgram.scenes import Layouts, Rays, SceneConfig, Solids
+from rotorgram.scenes import (
+    SCENES,
+    Draft,
+    Layouts,
+    Rays,
+    SceneConfig,
+    SceneType,
+    Solids,
+    register,
+)
 from rotorgram.scenes.motion import along_ellipse, offsets, thrown
+from rotorgram.sim import make_world
 
 PERIOD = 0.02  # s: of a control step
 BACKENDS = pytest.mark.parametrize("backend", ["rigid", "mujoco"])
@@ -163,3 +174,17 @@ def test_drones_see_each_other() -> None:
             least = nearest - loop.vehicle.radius
             ground = place[world, drone, 2]
             assert seen[world, drone] == pytest.approx(min(least, ground), abs=0.02)
+
+
+def test_each_layout_of_a_scene_has_as_many_openings() -> None:
+    def draw(draft: Draft) -> None:
+        draft.add("ground/floor", "plane", (9, 9, 1), (0, 0, 0), "")
+        count = 1 + int(draft.rng.integers(4))
+        draft.openings = [(float(i), 0.0, 1.0, 1.0, 0.0, 0.5) for i in range(count)]
+
+    register("holes", SceneType(draw=draw))
+    try:
+        with pytest.raises(InputError, match=r"scene: expected [1-4] openings in each layout of h"):
+            make_world(Vehicle.load("crazyflie2"), 8, "rigid", scene=SceneConfig.parse("holes:0-9"))
+    finally:
+        SCENES.pop("holes")
