@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..models.errors import InputError
-from ..models.fields import Limits, NonNegativeInt, PositiveInt, check_fields, immutable
+from ..models.fields import Limits, PositiveInt, check_fields, immutable
 
 Positive = Annotated[float, Limits(0.0, 1e30, above=True)]
 """A number above 0 that float32 holds."""
@@ -23,7 +23,7 @@ class Config:
     """`mlp`, or `cnn` with convolutions over images and rings: see `networks.NETWORKS`."""
     filters: Sizes = (4, 8, 16)
     """Filters of each convolution of a `cnn`."""
-    memory: NonNegativeInt = 0
+    memory: Annotated[int, Limits(0, 4096, whole=True)] = 0
     """Units of a GRU before the hidden layers, which remembers an episode; 0: none."""
     hidden: Sizes = (16,)
     """Units of each hidden layer of each network (paper: one of 16)."""

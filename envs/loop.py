@@ -241,8 +241,8 @@ class Loop:
         record.restore(part_of(state, "record"))
         for stage in self.pipeline.stages:
             stage.restore(record, part_of(state, type(stage).__name__))
-        if not is_traced(record.steps):
-            self._move_solids(record.steps)
+            if stage is self.pipeline.flight and not is_traced(record.steps):
+                self._move_solids(record.steps)  # before what measures distances
 
     def __reduce__(self) -> Any:
         worlds = self.num_envs // self.config.drones

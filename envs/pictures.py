@@ -99,7 +99,7 @@ class Pictures(Instrument):
 
     def read(self, moment: Moment, due: ByName) -> ByName:
         """All pictures, shape (W, A, height, width, channels)."""
-        scenes = moment.scenery.which
+        scenes = moment.scenery.numbers
         count = moment.steps.size
         seen = {name: getattr(moment, name) for name in _SEEN}
         state = {name: x.reshape(count, -1) for name, x in seen.items() if x is not None}

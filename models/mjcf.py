@@ -127,19 +127,22 @@ def check_sizes(path: Path, what: str) -> None:
     seen = {path}
     total = 0
     numbers = 0
-    waiting = [(read_xml(path), 1)]
+    waiting: list[tuple[ElementTree.Element, int, tuple[Path, ...]]]
+    waiting = [(read_xml(path), 1, (path,))]
     while waiting:
-        element, times = waiting.pop()
+        element, times, around = waiting.pop()
         _check_element(element, what)
         if element.tag in _REPEATED:
             counts = filter(str.isdecimal, element.get("count", "").split())
             times *= math.prod(map(int, counts))
         elif element.tag in ("include", "model"):
             inner = path.parent / element.get("file", "")
+            if inner in around:
+                _refuse(what, "files that do not include themselves", str(inner))
             if inner not in seen:
                 _check_file(inner, what)
                 seen.add(inner)
-                waiting.append((read_xml(inner), times))
+                waiting.append((read_xml(inner), times, (*around, inner)))
         total += times
         numbers += times * _numbers(element)
         if total > MAX_ELEMENTS:
@@ -147,7 +150,7 @@ def check_sizes(path: Path, what: str) -> None:
         if numbers > MAX_NUMBERS:
             expected = f"at most {MAX_NUMBERS} numbers of assets and sensors"
             _refuse(what, expected, f"{numbers} or more")
-        waiting += [(child, times) for child in element]
+        waiting += [(child, times, around) for child in element]
 
 
 def _check_element(element: ElementTree.Element, what: str) -> None:

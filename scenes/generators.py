@@ -360,5 +360,7 @@ register(
 )
 register(
     "traffic",
-    SceneType(draw=traffic, materials=_MATERIALS["traffic"], most=most_of_traffic, room=0.0),
+    SceneType(
+        draw=traffic, materials=_MATERIALS["traffic"], most=most_of_traffic, room=0.0, moves=True
+    ),
 )

@@ -31,6 +31,8 @@ class SceneType:
     """Upper bound of the number of parts of a layout."""
     room: float = CLEARANCE
     """Half the width of the square about the z axis that a layout keeps free up to 20 m, m."""
+    moves: bool = False
+    """Whether some of its solids move."""
     options: tuple[str, ...] = ()
     """Which of `density`, `size` and `clear` it has."""
 

@@ -41,6 +41,7 @@ class Scenery(Kept):
     def __init__(self, scene: SceneConfig, own: Solids, worlds: int) -> None:
         """`own`: what stands in every layout, of the vehicle's file."""
         self.scene = scene
+        self.moves = scene.type.moves
         self._given = np.array([one.seed for one in scene.given_scenes], np.int64)
         self.seeds: Array = np.full(worlds, self._given[0] if self._given.size else -1, np.int64)
         self.which: Array = np.zeros(worlds, np.int64)
@@ -49,7 +50,6 @@ class Scenery(Kept):
         self.layouts = Layouts.of(*laid)
         self.openings: Array = np.zeros((worlds, *openings_of(scene, 0).shape))
         self._openings = np.array([self._opened(seed) for seed in self._given.tolist()])
-        self.moves = bool(self.solids(0).moves.any())
         if self.moves:  # each world has a time of its own
             most = self.most
             self._motions = np.zeros((worlds, most, len(REST)))
@@ -74,12 +74,20 @@ class Scenery(Kept):
 
     def solids(self, seed: int) -> Solids:
         """What stands in a layout, without ground and `own`."""
-        return Solids.of_layout(self.scene, seed)
+        solids = Solids.of_layout(self.scene, seed)
+        if solids.moves.any() and not self.moves:
+            raise InputError(f"scene: expected {self.scene.name} to be registered with moves=True")
+        return solids
 
     @property
     def varies(self) -> bool:
         """Whether episodes differ in their layouts, or times in one."""
         return len(self._given) != 1 or self.moves
+
+    @property
+    def numbers(self) -> Array:
+        """Which of the given scenes each world has, shape (W,)."""
+        return np.searchsorted(self._given, self.seeds)
 
     def snapshot(self) -> Snapshot:
         """Copies by name: nothing where all have the same layout."""
@@ -106,7 +114,7 @@ class Scenery(Kept):
         if is_traced(seeds):
             return
         if self._given.size and not self.moves:
-            self.which = np.searchsorted(self._given, seeds)
+            self.which = self.numbers
         else:
             self._lay(np.flatnonzero((seeds != old) & (seeds >= 0)))
         self._point()

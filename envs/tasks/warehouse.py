@@ -76,9 +76,10 @@ class Warehouse(Forest):
         scene = self.config.scene
         if scene.name != "aisles":
             raise InputError(f"scene: expected aisles with {self.config.env_id}, got {scene}")
+        usual = self.scene(self.options)
+        if not np.allclose(scene.size or 0.0, usual.size or 0.0):
+            raise InputError(f"scene: expected the size of {usual}, got {scene}")
         rows, aisles = counts(scene)
-        if not rows * aisles:
-            raise InputError(f"scene: expected a row of racks with an aisle, got {scene}")
         self.define_way(ROW * rows, AISLE * aisles)
 
     def begin(self, mask: Array, draw: Draw) -> InitialState:

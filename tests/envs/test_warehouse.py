@@ -102,3 +102,9 @@ def test_who_knows_the_aisles_arrives() -> None:
 def test_another_scene_is_refused() -> None:
     with pytest.raises(InputError, match=r"scene: expected aisles with rotorgram/Warehouse-v0"):
         task_of(WAREHOUSE, scene="forest:3")
+
+
+def test_a_hall_of_another_size_is_refused() -> None:
+    for size in ("15.9x9.6", "14x9.6", "4x4"):
+        with pytest.raises(InputError, match=r"scene: expected the size of aisles:new,size=12x7"):
+            task_of("rotorgram/Warehouse-v0", scene=f"aisles:new,size={size}")

@@ -22,7 +22,7 @@ from rotorgram.scenes import (
     Solids,
     register,
 )
-from rotorgram.scenes.motion import along_ellipse, offsets, thrown
+from rotorgram.scenes.motion import REST, along_ellipse, offsets, thrown
 from rotorgram.sim import make_world
 
 PERIOD = 0.02  # s: of a control step
@@ -142,6 +142,41 @@ def test_rays_and_pictures_see_them_where_they_are(opengl: None) -> None:
         assert (abs(picture - flat)[near] < 0.02 * flat[near]).mean() > 0.97  # all but edges
 
 
+def test_a_batch_has_the_pictures_of_its_layouts(opengl: None) -> None:
+    """Two worlds in one of two layouts each: the picture of a world that is alone in it."""
+    keywords: dict[str, Any] = {"cameras": "front_depth@32x24"}
+    seen = {}
+    for layout in range(2):
+        loop = loop_in(f"traffic:{layout}", "rigid", **keywords)
+        for _ in range(40):
+            step(loop)
+        seen[layout] = loop.observations["front_depth"]
+    assert (seen[0] != seen[1]).any()
+    both = loop_in("traffic:0-1", "rigid", **keywords)
+    for _ in range(40):
+        step(both)
+    for world, layout in enumerate(both.world.scenery.seeds.tolist()):
+        assert (both.observations["front_depth"][world] == seen[layout][world]).all()
+
+
+def test_a_scene_says_whether_its_solids_move() -> None:
+    def draw(draft: Draft) -> None:
+        draft.add("ground/floor", "plane", (9, 9, 1), (0, 0, 0), "")
+        motion = thrown((1.0, 0.0, 0.0), 0.0) if draft.rng.integers(2) else REST
+        draft.add("ball_0/ball", "sphere", (0.5, 0, 0), (9, 0, 1), "", motion=motion)
+
+    craft = Vehicle.load("crazyflie2")
+    scene = "balls:0-9"
+    try:
+        register("balls", SceneType(draw=draw))
+        with pytest.raises(InputError, match="scene: expected balls to be registered with moves"):
+            make_world(craft, 2, "rigid", scene=SceneConfig.parse(scene))
+        register("balls", SceneType(draw=draw, moves=True))
+        assert make_world(craft, 2, "rigid", scene=SceneConfig.parse(scene)).scenery.moves
+    finally:
+        SCENES.pop("balls")
+
+
 @BACKENDS
 def test_a_snapshot_brings_them_back(backend: str) -> None:
     ours = loop_in("traffic:0-5", backend, sensors={"lidar": True})
@@ -149,6 +184,7 @@ def test_a_snapshot_brings_them_back(backend: str) -> None:
     for _ in range(40):
         step(ours)
     theirs.restore(ours.snapshot())
+    assert (ours.record.state.clearance == theirs.record.state.clearance).all()
     for _ in range(20):
         step(ours)
         step(theirs)

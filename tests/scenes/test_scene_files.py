@@ -256,3 +256,13 @@ def test_the_file_of_the_page(tmp_path: Path, ending: str) -> None:
     scene = written(tmp_path, block, f"my_world.{ending}")
     counts = {"toml": 4, "xml": 6}
     assert len(Solids.of_layout(SceneConfig.parse(scene), 0)) == counts[ending]
+
+
+@pytest.mark.parametrize("tag", ["include", 'asset><model name="m"'])
+def test_a_file_that_includes_itself_is_refused(tmp_path: Path, tag: str) -> None:
+    closing = "</asset>" if tag.startswith("asset") else ""
+    file = tmp_path / "a.xml"
+    box = '<worldbody><geom type="box" size="1 1 1"/></worldbody>'
+    file.write_text(f'<mujoco><{tag} file="a.xml"/>{closing}{box}</mujoco>')
+    with pytest.raises(InputError, match="expected files that do not include themselves, got"):
+        Solids.of_scene(str(file))
