@@ -123,7 +123,8 @@ class Draft:
         rows = np.array(positions, float)
         turns = np.full(len(rows), headings, float)
         own = np.array(kinds, np.int8), np.array(sizes, float)
-        motions = np.tile(motion, (len(rows), 1))
+        motions = np.zeros((len(rows), len(REST)))
+        motions[:] = motion
         self.parts.append(Parts(names, *own, rows, materials, turns, motions))
 
 

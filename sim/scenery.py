@@ -177,7 +177,11 @@ class Scenery(Kept):
     def _lay(self, worlds: NDArray[np.int64]) -> None:
         """Lay out what these worlds have: each has a row of its own."""
         count = len(self.seeds)
-        made = {world: self.solids(int(self.seeds[world])) for world in worlds.tolist()}
+        made = {}
+        for world in worlds.tolist():
+            seed = int(self.seeds[world])
+            made[world] = self.solids(seed)
+            self.openings[world] = self._opened(seed)
         kinds, tables = self.layouts
         largest = max(map(len, made.values()), default=0)
         most = max(kinds.shape[1], len(self._always) + largest)
@@ -189,7 +193,6 @@ class Scenery(Kept):
             self.which = np.arange(count)
         for world, solids in made.items():
             self.layouts.put(world, self._always, solids)
-            self.openings[world] = self._opened(int(self.seeds[world]))
             if self.moves:
                 self._motions[world, : len(solids)] = solids.motions
                 self._motions[world, len(solids) :] = REST
