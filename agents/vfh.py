@@ -173,7 +173,8 @@ def seen(ranges: Array, thrust_axis: Array, height: Array, reach: float) -> Arra
     z = (-forward * ax - left * ay * az) / size
     above = z + height[:, None]
     is_obstacle = (ranges < 0.99 * reach) & (above > LOW) & (above < HIGH)
-    distance = np.where(is_obstacle, np.hypot(x, y), np.inf).reshape(len(ranges), SECTORS, -1)
+    level = np.where(is_obstacle, np.hypot(x, y), np.inf)
+    distance = level.reshape(len(ranges), SECTORS, -1)
     first = distance.argmin(axis=2)[..., None]
     points = np.where(is_obstacle, np.stack((x, y)), np.inf).reshape(2, *distance.shape)
     return np.take_along_axis(points, first[None], axis=3)[..., 0]

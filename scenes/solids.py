@@ -228,9 +228,10 @@ class Solids:
         """How far a sphere flies straight before it touches a solid, in its radii: the mean.
 
         It starts where it has room, at `count` random places between the corners `low` and `high`,
-        m, in random level directions; a way ends at the border at the latest. The measure of
-        difficulty of AvoidBench (H. Yu, G. de Croon and C. De Wagter, 2023), from S. Nous et al.
-        2016; the lower, the harder. The same solids have the same number. 0 where there is no room.
+        m, in random level directions; a way ends at the border at the latest. A measure of
+        difficulty in the way of AvoidBench (H. Yu, G. de Croon and C. De Wagter, 2023); the
+        definition is ours. The lower, the harder; 0 where there is no room. The same solids have
+        the same number.
         """
         check("radius", Limits(1e-3, 1e3, "m"), radius)
         first, last = numbers("low", low), numbers("high", high)

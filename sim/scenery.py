@@ -94,8 +94,8 @@ class Scenery(Kept):
         return super().snapshot() if self.varies else {}
 
     def begin(self, random: Random, mask: Array, ahead: int = 0) -> None:
-        """Draw the layouts of the worlds of a mask, bool, (W, A), as of `Draw`. Code that is
-        compiled does not draw: it is given the seeds.
+        """Draw the layouts of the worlds of a mask, bool, (W, A), as of `Draw`. Compiled code does
+        not draw: it gets the seeds.
         """
         if not self.varies or is_traced(mask):
             return
