@@ -179,7 +179,7 @@ def test_the_smallest_damage_is_noticed(kept: Checkpoint, tmp_path: Path) -> Non
 def with_nan(arrays: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
     """The arrays, the first number of which is NaN."""
     copies = {name: array.copy() for name, array in arrays.items()}
-    numbers = [array for array in copies.values() if array.dtype.kind == "f"]
+    numbers = [array for array in copies.values() if array.dtype.kind == "f" and array.size]
     numbers[0].flat[0] = np.nan
     return copies
 

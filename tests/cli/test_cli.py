@@ -528,7 +528,7 @@ def test_nothing_that_a_checkpoint_names_is_imported(
         named = replace(kept, spec=replace(kept.spec, env_id=name), env_steps=600)
         store(named, folder / "checkpoint.safetensors")
         assert run(capsys, "evaluate", folder, "--episodes", 1)[0] == (not known)
-        assert run(capsys, "train", "a2c", "--resume", folder)[0] == 1
+        assert run(capsys, "train", "a2c", "--resume", folder)[0] == (not known)
     config = EnvConfig.from_keywords(name, **named.options)
     (trajectory,) = flown_trajectories(named.policy(), config, [0])  # as `render`
     assert trajectory.spec.env_id == "rotorgram/Elevation-v0"
