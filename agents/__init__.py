@@ -1,4 +1,4 @@
-"""Learning algorithms, their policies and files, and controllers: PID, geometric and ORCA.
+"""Learning algorithms, their policies and files, and controllers: PID and geometric.
 
 Only SB3's algorithms need torch. Each name is imported when it is first used.
 """
@@ -11,11 +11,10 @@ if TYPE_CHECKING:
     from .a2c import A2CConfig
     from .checkpoints import Checkpoint, load, store
     from .config import Config
-    from .controllers import CONTROLLERS
+    from .controllers import CONTROLLERS, Controller, find_controller, is_controller
     from .episodes import Episode, EpisodeRecorder, ResumeError
     from .geometric import Geometric
     from .making import make_agent, resume_agent
-    from .orca import Orca
     from .pid import PID
     from .policies import NetworkPolicy, Policy
     from .ppo import PPOConfig
@@ -24,10 +23,10 @@ if TYPE_CHECKING:
     from .vpg import VPGConfig
 
 __all__ = [
-    "ALGORITHMS", "CONTROLLERS", "PID", "A2CConfig", "Agent", "Checkpoint", "Config", "Episode",
-    "EpisodeRecorder", "Geometric", "NetworkPolicy", "Orca", "PPOConfig", "Policy", "ResumeError",
-    "VPGConfig", "find_algorithm", "find_preset", "load", "make_agent", "preset", "resume_agent",
-    "store",
+    "ALGORITHMS", "CONTROLLERS", "PID", "A2CConfig", "Agent", "Checkpoint", "Config",
+    "Controller", "Episode", "EpisodeRecorder", "Geometric", "NetworkPolicy", "PPOConfig", "Policy",
+    "ResumeError", "VPGConfig", "find_algorithm", "find_controller", "find_preset", "is_controller",
+    "load", "make_agent", "preset", "resume_agent", "store",
 ]  # fmt: skip
 
 __getattr__ = import_when_used(__name__)

@@ -26,6 +26,8 @@ class APGConfig(Config):
     max_grad_norm: Positive = 1.0
     """The gradient, as one vector, is scaled down to this length."""
 
+    remembers = False
+
 
 class APG(Learner):
     """Climb the discounted rewards of short flights, by their derivative.
@@ -37,7 +39,6 @@ class APG(Learner):
     config: APGConfig
 
     def __init__(self, log: EpisodeRecorder, config: APGConfig, seed: int) -> None:
-        config.check_forgetful("apg")
         super().__init__(log, config, seed)
         loop = getattr(log.env, "loop", None)
         machine = loop.machine() if isinstance(loop, CompiledLoop) else None

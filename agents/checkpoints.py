@@ -104,8 +104,7 @@ class Checkpoint:
     def other_versions(self) -> dict[str, tuple[str, str]]:
         """Software that has another version now: its version then and now."""
         now = software_versions()
-        names = sorted({*self.versions, *now})
-        pairs = {name: (self.versions.get(name, "none"), now.get(name, "none")) for name in names}
+        pairs = {name: (then, now.get(name, "none")) for name, then in self.versions.items()}
         return {name: pair for name, pair in pairs.items() if pair[0] != pair[1]}
 
 

@@ -44,20 +44,20 @@ class Config:
 
     squashed: ClassVar[bool] = False
     """Whether the policy bounds its output by tanh."""
+    remembers: ClassVar[bool] = True
+    """Whether the algorithm trains a memory."""
 
     def __post_init__(self) -> None:
         check_fields(self)
+        if self.memory and not self.remembers:
+            own = type(self).__name__
+            raise InputError(f"memory: expected 0 with {own}, got {self.memory}; ppo trains one")
 
     def scaled(self, rewards: NDArray[np.float64]) -> NDArray[np.float64]:
         """The rewards that it learns from."""
         scaled = self.reward_scale * rewards
         most = self.reward_clip
         return scaled if most is None else np.clip(scaled, -most, most)
-
-    def check_forgetful(self, user: str) -> None:
-        """Raise `InputError`, which names the algorithm, for a memory that it cannot train."""
-        if self.memory:
-            raise InputError(f"memory: expected 0 with {user}, got {self.memory}; ppo trains one")
 
     def least_steps(self, drones: int, episode_length: int) -> int:
         """Env steps that a training needs for one update, with all drones together."""
@@ -87,6 +87,7 @@ class SACConfig(RolloutConfig):
     """
 
     squashed = True
+    remembers = False
     hidden: tuple[int, ...] = (256, 256)
     """Units of each hidden layer of each network."""
     learning_rate: float = 0.0003

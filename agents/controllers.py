@@ -1,14 +1,48 @@
-"""Every controller: an agent that needs no training, made of an env's spec."""
+"""Controllers: agents that need no training, made of an env's spec. A user's own are classes in
+files.
+"""
 
+from collections.abc import Mapping
+from typing import ClassVar, Final, Protocol
+
+from ..envs.spec import EnvSpec
+from ..models.errors import InputError
+from ..models.user_code import load_class, names_class
 from .geometric import Geometric
-from .orca import Orca
 from .pid import PID
-from .vfh import Vfh
+from .policies import Policy
 
-Controller = type[PID] | type[Geometric] | type[Orca] | type[Vfh]
-CONTROLLERS: dict[str, Controller] = {
-    "pid": PID,
-    "geometric": Geometric,
-    "orca": Orca,
-    "vfh": Vfh,
-}
+
+class Controller(Policy, Protocol):
+    """What a class of controllers has. One object flies one drone."""
+
+    label: ClassVar[str]
+    """Name in tables and figures."""
+    options: ClassVar[Mapping[str, object]]
+    """Options of the env that it needs, as {"action": "velocity"}: commands set them."""
+
+    def __init__(self, spec: EnvSpec) -> None:
+        """Raises `InputError` for an env that it cannot fly."""
+
+
+CONTROLLERS: Final[Mapping[str, type[Controller]]] = {"pid": PID, "geometric": Geometric}
+_NEEDED = ("label", "options", "reset", "act")
+
+
+def is_controller(name: str) -> bool:
+    """Whether a name is one of `CONTROLLERS`, or `FILE.py:CLASS`."""
+    return name in CONTROLLERS or names_class(name)
+
+
+def find_controller(name: str) -> type[Controller]:
+    """The class of a controller that a user names. Raises `InputError`."""
+    if name in CONTROLLERS:
+        return CONTROLLERS[name]
+    kind: type[Controller] = load_class("controller", name)
+    missing = [attribute for attribute in _NEEDED if not hasattr(kind, attribute)]
+    if missing:
+        raise InputError(
+            f"controller: expected a class with {', '.join(_NEEDED)}, "
+            f"got {name} without {missing[0]}"
+        )
+    return kind

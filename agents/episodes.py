@@ -8,6 +8,7 @@ import time
 from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import lru_cache
+from itertools import starmap
 from typing import Annotated, NamedTuple
 
 import numpy as np
@@ -133,10 +134,9 @@ class EpisodeRecorder:
         self._rewards = np.zeros(count)
         self._sizes = np.zeros(count)
         self._seeds = np.zeros(count, np.uint64)
-        self._nothing = np.full((count, 1), np.nan)
         self._flown: list[Array] = []  # actions; at least those of the running episodes
         self._keep_steps = keep_steps
-        self._steps: list[NDArray[np.float64]] = []
+        self._steps: list[Array] = []
         self._still = self.actions.to_envs(np.zeros((count, self.actions.size), np.float32))
 
     @property
@@ -168,16 +168,15 @@ class EpisodeRecorder:
         """
         env = self.env
         sent = self.actions.to_envs(actions)
-        seeds = None
         idle = self._idle(frozen)
+        seeds = None
         if begins is not None:
             self._number(begins)
             seeds = self._seeds
-            idle = begins if idle is None else begins | idle
         env.advance(sent, begins, seeds, frozen)
         self._flown.append(sent)
         self._keep_step(idle)
-        self.env_steps += self.num_envs - (0 if idle is None else int(np.count_nonzero(idle)))
+        self.env_steps += self.num_envs - int(np.count_nonzero(idle))
         ended = env.terminated | env.truncated
         if np.count_nonzero(ended):  # of few drones faster than `any`
             self._keep_episodes(ended)
@@ -250,17 +249,10 @@ class EpisodeRecorder:
     def steps(self) -> dict[str, Array]:
         """Every step that was flown, in the order of flight, those of one moment drone by drone.
 
-        `episode` (int64), and float32 of the shape (T,): `value` of the headline metric, `reward`,
-        and `thrust`, the mean over the rotors in N. NaN where the env does not tell it.
+        `episode` and `value` of the headline metric, NaN where there is none: shape (T,).
         """
-        episode, *others = np.concatenate([np.zeros((0, 4)), *self._steps]).T
-        value, reward, thrust = np.array(others, np.float32)
-        return {
-            "episode": episode.astype(np.int64),
-            "value": value,
-            "reward": reward,
-            "thrust": thrust,
-        }
+        episode, value = np.concatenate([np.zeros((0, 2)), *self._steps]).T
+        return {"episode": episode.astype(np.int64), "value": value}
 
     def _repeat(self, flown: Flown) -> bool:
         """Fly the actions of a position; whether a simulator was lost."""
@@ -283,10 +275,8 @@ class EpisodeRecorder:
                 break  # too early: the lengths differ
         return False
 
-    def _idle(self, frozen: Mask | None) -> Mask | None:
-        """Who flies no env step now: frozen drones, and those that are out while others fly on."""
-        if self._together == 1:
-            return frozen
+    def _idle(self, frozen: Mask | None) -> Mask:
+        """Who flies no env step now: frozen drones, and those that are out, which begin or wait."""
         return self.out if frozen is None else frozen | self.out
 
     def _number(self, drones: Mask) -> None:
@@ -313,39 +303,29 @@ class EpisodeRecorder:
         for drone in drones:
             self._seeds[drone] = episode_seed(self.run_seed, int(self._numbers[drone]))
 
-    def _keep_step(self, idle: Mask | None) -> None:
+    def _keep_step(self, idle: Mask) -> None:
         values = self.env.headline
         sizes = np.abs(values)
-        self._lengths += 1 if idle is None else ~idle
+        self._lengths += ~idle
         self._rewards += self.env.rewards  # 0 of those that did not fly
         metric = self.spec.headline
         if metric is None or not metric.final:
-            self._sizes += sizes if idle is None else np.where(idle, 0.0, sizes)
-        else:
-            last = sizes * self._lengths  # over which it is divided
-            self._sizes = last if idle is None else np.where(idle, self._sizes, last)
+            self._sizes += np.where(idle, 0.0, sizes)
+        else:  # it is divided by the length
+            self._sizes = np.where(idle, self._sizes, sizes * self._lengths)
         if self._keep_steps:
-            thrust = self.env.telemetry.get("thrust", self._nothing).mean(axis=1)
-            table = np.stack((self._numbers, values, self.env.rewards, thrust), axis=1)
-            self._steps.append(table if idle is None else table[~idle])
+            self._steps.append(np.stack((self._numbers, values), axis=1)[~idle])
 
     def _keep_episodes(self, ended: Mask) -> None:
         self._take_out(ended)
         flown = ended & (self._lengths > 0)  # others were lost before their first step
         env = self.env
-        for drone in np.flatnonzero(flown).tolist():
-            length = int(self._lengths[drone])
-            episode = Episode(
-                episode=int(self._numbers[drone]),
-                first_step=int(self._first_steps[drone]),
-                length=length,
-                total_reward=float(self._rewards[drone]),
-                mean_size=float(self._sizes[drone]) / length,
-                terminated=bool(env.terminated[drone]),
-                truncated=bool(env.truncated[drone]),
-                seconds=self.seconds,
-                simulator_lost=bool(env.lost[drone]),
-            )
-            self.episodes.append(episode)
+        columns = (
+            self._numbers, self._first_steps, self._lengths, self._rewards,
+            self._sizes / np.maximum(self._lengths, 1), env.terminated, env.truncated,
+            np.full(self.num_envs, self.seconds), env.lost,
+        )  # fmt: skip
+        rows = zip(*(column[flown].tolist() for column in columns), strict=True)
+        self.episodes += starmap(Episode, rows)
         keep = int(np.max(self._lengths, where=~ended, initial=0))
         self._flown = self._flown[len(self._flown) - keep :]

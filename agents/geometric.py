@@ -35,8 +35,8 @@ class Geometric:
     Raises `InputError` for an env that lacks what it needs.
     """
 
-    label = "Geometric"
-    options: ClassVar[dict[str, str]] = {"action": "position"}
+    label: ClassVar[str] = "Geometric"
+    options: ClassVar[Mapping[str, object]] = {"action": "position"}
     """Options of the env that it flies."""
 
     def __init__(self, spec: EnvSpec) -> None:

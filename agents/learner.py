@@ -64,10 +64,13 @@ class Learner:
             self._critic = make_network(seen, 1, config)
             self._critic.bind(self.weights.of_one(1, self._critic.shapes))
             self._critic.initialise(rng, 1.0)
-        self._memory = np.zeros((count, config.memory, log.num_envs), np.float32)
-        if actor.memory:
-            actor.memory.state = self._memory[0]
         self.optimizer = Adam(self.weights, self.epsilon)
+        self._arrays = {"weights": self.weights.values, **named("optimizer.", self.optimizer.state)}
+        if actor.memory:
+            # What actor and critic remember of the running episodes.
+            self._memory = np.zeros((count, config.memory, log.num_envs), np.float32)
+            self._arrays["memory"] = self._memory
+            actor.memory.state = self._memory[0]
 
     @abstractmethod
     def collect(self, collector: Collector, most: int) -> Rollout:
@@ -106,26 +109,20 @@ class Learner:
 
     def state(self) -> ByName:
         """All that the next update depends on: copies."""
-        arrays = {name: array.copy() for name, array in self._state().items()}
+        arrays = {name: array.copy() for name, array in self._arrays.items()}
         generator = json.dumps(self._rng.bit_generator.state).encode()
         return arrays | {"rng": np.frombuffer(generator, np.uint8)}
 
     def set_state(self, state: ByName) -> None:
         """Take over a state. Raises `ValueError`, `TypeError` or `KeyError` unless it is whole."""
         self._rng.bit_generator.state = json.loads(state["rng"].tobytes())
-        arrays = self._state()
-        expected = {name: array.shape for name, array in arrays.items()}
+        expected = {name: array.shape for name, array in self._arrays.items()}
         got = {name: array.shape for name, array in state.items() if name != "rng"}
         if got != expected:
             raise ValueError(f"state: expected arrays of shapes {expected}, got {got}")
-        for name, array in arrays.items():
+        for name, array in self._arrays.items():
             array[...] = state[name]
         self.terms = {}
-
-    def _state(self) -> ByName:
-        """The state without the generator: no copies."""
-        own = {"weights": self.weights.values, "memory": self._memory}
-        return own | named("optimizer.", self.optimizer.state)
 
     def scalars(self) -> dict[str, float]:
         """Numbers of the last update, as in `docs/algorithms/README.md`; none before the first."""

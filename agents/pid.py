@@ -29,8 +29,8 @@ class PID:
     Raises `InputError` for another env, or where options or telemetry lack what it needs.
     """
 
-    label = "PID"
-    options: ClassVar[dict[str, str]] = {}
+    label: ClassVar[str] = "PID"
+    options: ClassVar[Mapping[str, object]] = {}
     """Options of the env that it needs."""
 
     def __init__(self, spec: EnvSpec) -> None:

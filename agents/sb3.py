@@ -14,7 +14,7 @@ from .episodes import EpisodeRecorder
 from .layers import ByName, Floats
 from .learner import OnUpdate, seeds_of
 from .networks import distances_in
-from .policies import NetworkPolicy
+from .policies import NetworkPolicy, flat_size
 from .ppo import PPO, PPOConfig
 from .rollouts import Diverged
 
@@ -109,9 +109,8 @@ class RecordedEnv(VectorEnv[Floats, Floats, np.ndarray]):
         self._config = config
         self.num_envs = recorder.num_envs
         self.metadata = {"autoreset_mode": AutoresetMode.SAME_STEP}
-        bounds = [np.reshape(array.bounds(), (2, -1)) for array in recorder.spec.observation]
-        low, high = np.concatenate(bounds, axis=1).astype(np.float32)
-        self.single_observation_space = spaces.Box(low, high)
+        size = flat_size(recorder.spec)
+        self.single_observation_space = spaces.Box(-np.inf, np.inf, (size,))
         actions = recorder.actions
         box = spaces.Box(-1, 1, (actions.size,))
         self.single_action_space = spaces.Discrete(actions.outputs) if actions.discrete else box
@@ -155,9 +154,9 @@ class SB3Agent:
     """
 
     def __init__(self, log: EpisodeRecorder, config: A2CConfig | SACConfig, seed: int) -> None:
-        if config.network != "mlp":
-            raise InputError(f"network: expected mlp with SB3, got {config.network!r}")
-        config.check_forgetful("SB3")
+        if config.network != "mlp" or config.memory:
+            got = f"{config.network!r} with a memory of {config.memory}"
+            raise InputError(f"network: expected mlp without memory with SB3, got {got}")
         if distances_in(log.spec.observation):
             raise InputError(
                 "sb3: expected observations without distances of rays, which our own agents "

@@ -23,9 +23,10 @@ class VPGConfig(Config):
     normalize: bool = False
     """Divide the returns of an update by their standard deviation."""
 
+    remembers = False
+
     def __post_init__(self) -> None:
         super().__post_init__()
-        self.check_forgetful("vpg")
         if self.baseline == "time" and self.episodes_per_update == 1:
             raise InputError(
                 "episodes_per_update: expected 2 or more with baseline 'time', where a single "

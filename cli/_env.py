@@ -6,8 +6,15 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from ..agents import CONTROLLERS, Checkpoint, Policy, load
-from ..agents.controllers import Controller
+from ..agents import (
+    CONTROLLERS,
+    Checkpoint,
+    Controller,
+    Policy,
+    find_controller,
+    is_controller,
+    load,
+)
 from ..envs.config import BACKEND_KEYWORDS, BackendConfig
 from ..envs.registry import env_spec, is_known, task_type
 from ..envs.spec import EnvSpec
@@ -24,9 +31,14 @@ F = TypeVar("F", bound=EnvFlags)
 _CONNECT_TIMEOUT = 30 * 24 * 3600.0  # s: Ctrl-C ends the wait for a simulator
 
 
-def load_checkpoint(name: str) -> Checkpoint | Controller:
-    """One of `CONTROLLERS`, or what `trained` gives. Raises `InputError`."""
-    return CONTROLLERS[name] if name in CONTROLLERS else trained(name, *CONTROLLERS)
+Pilot = Checkpoint | type[Controller]
+
+
+def load_pilot(name: str) -> Pilot:
+    """A controller, or what `trained` gives. Raises `InputError`."""
+    if is_controller(name):
+        return find_controller(name)
+    return trained(name, *CONTROLLERS, "FILE.py:CLASS of a controller")
 
 
 def trained(name: str, *others: str) -> Checkpoint:
@@ -42,7 +54,7 @@ def trained(name: str, *others: str) -> Checkpoint:
     return load(file)
 
 
-def fitted(command: F, checkpoint: Checkpoint | Controller) -> F:
+def fitted(command: F, checkpoint: Pilot) -> F:
     """The command with the env that a checkpoint was trained in, or with the options that a
     controller needs.
 
@@ -93,7 +105,7 @@ def in_unseen(command: F) -> F:
     return replace(command, options={**command.options, "scene": str(scene.unseen())})
 
 
-def policy_for(command: EnvFlags, checkpoint: Checkpoint | Controller, spec: EnvSpec) -> Policy:
+def policy_for(command: EnvFlags, checkpoint: Pilot, spec: EnvSpec) -> Policy:
     """The policy of a checkpoint, or a controller. Raises `InputError` if it does not fit the env,
     or was trained on another vehicle and the user has not named one.
     """
@@ -115,7 +127,7 @@ def pilot_of(command: F, what: str) -> tuple[F, Policy | None]:
     """The command with the env of a policy, and the policy; None for `random`."""
     if what == "random":
         return command, None
-    checkpoint = load_checkpoint(what)
+    checkpoint = load_pilot(what)
     command = in_unseen(fitted(command, checkpoint))
     return command, policy_for(command, checkpoint, env_spec(command.env_config()))
 

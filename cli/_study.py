@@ -112,9 +112,12 @@ class StudyFlags(TrainingFlags, WorkersConfig):
         return {name: getattr(self, name) for name in names if name in self.given}
 
     def new_row(self, agent: str, name: str, changes: Options, env: "EnvConfig") -> "Row":
-        """A row of an algorithm, with the settings that were given."""
+        """A row of an agent, with the settings that were given."""
+        from ..agents import is_controller
         from ..training.settings import Row
 
+        if is_controller(agent):
+            return Row(agent=agent, name=name, env=env)
         settings: Options = {"env_steps": 200_000, "num_envs": env.drones, "backend": "mujoco"}
         settings |= self.given_of_rows()
         return Row(agent=agent, name=name, env=env, set=changes, **settings)

@@ -4,12 +4,12 @@ import inspect
 import re
 import sys
 from collections.abc import Iterator
-from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import Positional, arg
 
 from ..models.errors import InputError, one_line
+from ..models.user_code import load_class, names_class
 from ._flags import Command
 
 if TYPE_CHECKING:
@@ -53,24 +53,14 @@ class CheckTask(Command):
 
 def _env_id(task: str) -> str:
     """Id of a task, which is registered. Raises `InputError`."""
-    from importlib.util import module_from_spec, spec_from_file_location
-
     from ..envs import Task, registry
 
-    file, _, name = task.rpartition(":")
-    if name.endswith(".py"):
-        raise InputError(f"task: expected FILE.py:CLASS, got {task}")
-    if not file.endswith(".py"):
+    if not names_class(task):
         return registry.load(task)
-    path = Path(file)
-    spec = spec_from_file_location(path.stem, path)
-    if spec is None or spec.loader is None or not path.is_file():
-        raise InputError(f"task: expected a file of Python, there is none: {file}")
-    module = sys.modules[path.stem] = module_from_spec(spec)
-    spec.loader.exec_module(module)
-    kind = getattr(module, name, None)
-    if not isinstance(kind, type) or not issubclass(kind, Task):
-        raise InputError(f"task: expected a class derived from Task in {file}, got {name!r}")
+    kind = load_class("task", task)
+    name = kind.__name__
+    if not issubclass(kind, Task):
+        raise InputError(f"task: expected a class derived from Task, got {name!r}")
     registry.register(f"{name}-v0", kind)
     return f"{name}-v0"
 

@@ -7,16 +7,13 @@ from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import Positional, arg
 
-from ..agents.registry import AlgorithmName
 from ..models import InputError
 from ._flags import DEFAULT_ENV
 from ._study import StudyFlags
 
 if TYPE_CHECKING:
-    from ..training.settings import Row, Study
+    from ..training.settings import Study
 
-_CONTROLLERS = ("pid", "orca")
-"""Flown beside the agents where they can fly the env."""
 _OF_FILES = ("seeds", "first_seed", "snapshots", "curve_episodes", "episodes", "evaluation",
                     "wire", "keep_steps")  # fmt: skip
 """Settings of a study that all files share."""
@@ -34,9 +31,9 @@ class Compare(StudyFlags):
     files: Positional[Annotated[tuple[Path, ...], arg(metavar="FILE")]] = ()
     """TOML files: of one row (agent, env, set, …), named by its file, or of [[row]] tables. They
     train in this process, unless --udp is given."""
-    agents: tuple[AlgorithmName, ...] = ("vpg", "a2c", "sb3-a2c")
-    """Algorithms to train without files; the PID, or ORCA where a world has several drones, flies
-    beside them."""
+    agents: tuple[str, ...] = ("vpg", "a2c", "sb3-a2c")
+    """Algorithms to train without files, and controllers: geometric, FILE.py:CLASS. The PID flies
+    beside them where it can."""
     udp: bool = True
     """Whether each of them trains over UDP, with a simulator process of its own. The numbers are
     the same without, but for the times."""
@@ -62,28 +59,21 @@ class Compare(StudyFlags):
         return replace(studies[0], rows=tuple(rows), kind="compare", **settings)
 
     def _of_agents(self) -> "Study":
-        from ..training.settings import Kind, Study
+        from ..agents import CONTROLLERS
+        from ..envs.registry import env_spec
+        from ..training.settings import Kind, Row, Study, short_name
 
         env = self.env_config()
         changes = self.changes()
         if not self.agents:
             raise InputError("agents: expected at least one, got none")
-        rows = [self.new_row(agent, agent, changes, env) for agent in self.agents]
-        rows += [row for name in _CONTROLLERS for row in _controller(name, rows[0])]
         paper = env.env_id == DEFAULT_ENV
+        rows = [self.new_row(agent, short_name(agent), changes, env) for agent in self.agents]
+        if "pid" not in self.agents:
+            with suppress(InputError):  # it flies one task
+                CONTROLLERS["pid"](env_spec(env))
+                rows.append(Row(agent="pid", name="pid", env=env))
         kind: Kind = "paper" if paper else "compare"
         return Study(
             rows=tuple(rows), kind=kind, wire=self.udp, keep_steps=paper, **self.given_of_study()
         )
-
-
-def _controller(name: str, beside: "Row") -> list["Row"]:
-    """The row of a controller that can fly the same env as another row."""
-    from ..agents import CONTROLLERS
-    from ..envs.registry import env_spec
-    from ..training.settings import Row
-
-    with suppress(InputError):
-        CONTROLLERS[name](env_spec(beside.env))
-        return [Row(agent=name, name=name, env=beside.env)]
-    return []

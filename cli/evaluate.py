@@ -11,20 +11,20 @@ class Evaluate(AgentFlags, BackendFlags):
     """Measure a trained policy or a controller over episodes without exploration."""
 
     policy: Positional[Annotated[str, arg(metavar="POLICY")]]
-    """Checkpoint, folder of a training, pid, geometric, orca or vfh."""
+    """Checkpoint, folder of a training, pid, geometric, or FILE.py:CLASS of a controller."""
     episodes: Count = 20
     """Episodes to fly, from seeds that no training uses."""
 
     def run(self) -> None:
         """Fly and print the means."""
+        import numpy as np
         import pandas as pd
 
-        from ..flights.surroundings import Passage
-        from ..flights.trajectories import fly_episodes
+        from ..flights.trajectories import fly_episodes, mean_traversability
         from ..training.metrics import Headline, measure_episode
-        from ._env import fitted, in_unseen, load_checkpoint, policy_for, remote_env
+        from ._env import fitted, in_unseen, load_pilot, policy_for, remote_env
 
-        checkpoint = load_checkpoint(self.policy)
+        checkpoint = load_pilot(self.policy)
         command = in_unseen(fitted(self, checkpoint))
         with remote_env(command, num_envs=command.drones, backend=self.backend) as env:
             headline = Headline.of(env.env_spec)
@@ -46,10 +46,11 @@ class Evaluate(AgentFlags, BackendFlags):
             print(f"settling   {bound}: {when} ({count} of {len(rows)} episodes)")
         if headline.signed:
             print(f"overshoot  {overshoot}")
-        passage = Passage.of(trajectories)
-        if passage:
-            print(f"touched    {passage.touched:.1%}")
-            print(f"time       {passage.time:.2f} s")
-            print(f"speed      mean {passage.mean_speed:.2f} m/s, top {passage.top_speed:.2f} m/s")
-            print(f"clearance  at least {passage.least_clearance:.2f} m in the mean of flights")
-            print(f"scene      traversability {passage.traversability:.1f}")
+        ends = np.mean([one.telemetry["metrics"][-1] for one in trajectories], axis=0)
+        for metric, mean_end in zip(trajectories[0].spec.metrics[1:], ends[1:], strict=True):
+            if metric.final:
+                name = metric.name.replace("_", " ")
+                print(f"{name:10} {mean_end:.3g} {metric.unit}".rstrip())
+        hard = mean_traversability(trajectories)
+        if hard == hard:  # no nan
+            print(f"scene      traversability {hard:.1f}")

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from tyro.conf import Positional
 
+from ..agents import is_controller
 from ..flights.palette import agent_label
 from ..flights.recorded import recorded_trajectories
 from ..flights.trajectories import flown_trajectories
@@ -26,8 +27,8 @@ class Render(EnvFlags):
     """
 
     what: Positional[Annotated[Words, OneOrMore()]]
-    """Checkpoint, folder of a training, pid, geometric, orca, vfh, random, or a journal (.mcap).
-    Policies fly evaluation episodes without exploration."""
+    """Checkpoint, folder of a training, pid, geometric, FILE.py:CLASS of a controller, random, or a
+    journal (.mcap). Policies fly evaluation episodes without exploration."""
     out: Path
     """film.mp4, picture.png, or a folder for pictures 0001.png and so on. It must not
     exist."""
@@ -102,8 +103,10 @@ class Render(EnvFlags):
         episodes = range(self.episode, self.episode + self.episodes)
         rays = RANGES if self.rays else ()
         path = Path(what)
-        is_file = path.suffix in (".mcap", ".safetensors")
-        name = agent_label(path.stem if is_file else path.name)
+        name = what
+        if not is_controller(what):
+            name = path.stem if path.suffix in (".mcap", ".safetensors") else path.name
+        name = agent_label(name)
         if path.suffix == ".mcap":
             recorded = recorded_trajectories(
                 path, episodes, session=self.session, drone=self.drone, observations=rays

@@ -15,7 +15,7 @@ class Serve(AgentFlags):
     """
 
     policy: Positional[str]
-    """Checkpoint, folder of a training, pid, geometric, orca or vfh."""
+    """Checkpoint, folder of a training, pid, geometric, or FILE.py:CLASS of a controller."""
     listen: Annotated[str | None, arg(metavar="HOST:PORT")] = "127.0.0.1:8001"
     """Address to wait at."""
     episodes: Count | None = None
@@ -25,9 +25,9 @@ class Serve(AgentFlags):
         """Fly episode after episode."""
         from ..flights.trajectories import fly_episodes
         from ..udp import LinkError
-        from ._env import fitted, in_unseen, load_checkpoint, policy_for, print_episode, remote_env
+        from ._env import fitted, in_unseen, load_pilot, policy_for, print_episode, remote_env
 
-        checkpoint = load_checkpoint(self.policy)
+        checkpoint = load_pilot(self.policy)
         episode = 0
         with remote_env(in_unseen(fitted(self, checkpoint)), num_envs=None) as env:
             policy = policy_for(self, checkpoint, env.env_spec)

@@ -1,6 +1,6 @@
 """Order, names and colours of agents in all tables and figures."""
 
-from ..agents import ALGORITHMS, CONTROLLERS
+from ..agents import ALGORITHMS, find_controller, is_controller
 
 # Okabe and Ito's palette: told apart by readers with colour-blindness.
 FLIGHT_COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#8C564B")
@@ -10,13 +10,15 @@ _SPARE = FLIGHT_COLORS[3:]
 
 def agent_label(agent: str) -> str:
     """The name under which an agent is shown."""
-    row = ALGORITHMS.get(agent) or CONTROLLERS.get(agent)
-    return row.label if row else agent
+    if is_controller(agent):
+        return find_controller(agent).label
+    known = ALGORITHMS.get(agent)
+    return known.label if known else agent
 
 
 def agent_color(agent: str) -> str:
     """An agent's colour, the same in every figure and report."""
-    if agent in CONTROLLERS:
+    if is_controller(agent):
         return "#555555"
     known = ALGORITHMS.get(agent)
     if known and known.color:

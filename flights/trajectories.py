@@ -6,7 +6,7 @@ journals.
 
 import copy
 from collections.abc import Collection, Iterable, Mapping, Sequence
-from contextlib import closing
+from contextlib import closing, suppress
 from dataclasses import field
 from functools import cached_property
 from typing import TYPE_CHECKING, Literal, get_args
@@ -31,6 +31,7 @@ if TYPE_CHECKING:
 Floats = NDArray[np.float64]
 
 _EVALUATION = 20230324  # the day the paper appeared
+_SIZE = (40.0, 40.0)  # m: square about the z axis that counts of a scene without a size
 
 EpisodeSet = Literal["final", "curve", "tuning"]
 """Evaluation episodes that share no start: `final` for the figures that are reported, `curve` for
@@ -150,19 +151,30 @@ class Trajectory:
             return np.full(len(self) + 1, np.nan)
         return self.telemetry["metrics"][:, 0]
 
-    @property
-    def mean_thrust(self) -> Floats:
-        """Mean over the rotors, N, shape (T + 1,); nan without telemetry of thrust."""
-        if "thrust" not in self.telemetry:
-            return np.full(len(self) + 1, np.nan)
-        mean: Floats = self.telemetry["thrust"].mean(axis=1)
-        return mean
-
     def step_at(self, seconds: float) -> int:
         """Number of the row at that time; the last, from its end on."""
         # A time that is a whole number of periods but for its last bits belongs to that step.
         step = int(seconds / self.spec.control_period + 1e-6)
         return min(max(step, 0), len(self))
+
+
+def mean_traversability(flights: Iterable[Trajectory]) -> float:
+    """How hard the layouts of some flights are, as of `Solids.traversability`, at the heights of
+    their starts; nan where nothing stands, or a scene is not known here.
+    """
+    from ..scenes import Solids  # which imports MuJoCo
+
+    found = []
+    for flight in flights:
+        with suppress(InputError):  # a scene's file, or the telemetry, is elsewhere
+            solids = Solids.of_layout(flight.scene, flight.scene.seed)
+            half = np.array(flight.scene.size or _SIZE) / 2
+            height = flight.pose[0, 2]
+            radius = flight.spec.constant("radius", "traversability")
+            if len(solids):
+                hard = solids.traversability(radius, (*-half, height), (*half, height))
+                found.append(hard)
+    return float(np.mean(found)) if found else np.nan
 
 
 def common_scene(scenes: Iterable[SceneConfig]) -> SceneConfig:

@@ -14,13 +14,12 @@ from .registry import SCENES, SceneType, register, seeded_scenes
 
 if TYPE_CHECKING:
     from .build import add_scene, build_scene
-    from .paths import find_path
     from .rays import Rays
     from .solids import Layouts, Solids
 
 __all__ = [
     "SCENES", "Draft", "Layouts", "Rays", "SceneConfig", "SceneType", "Solids", "add_scene",
-    "build_scene", "find_path", "parse_scene", "register", "seeded_scenes",
+    "build_scene", "parse_scene", "register", "seeded_scenes",
 ]  # fmt: skip
 
 SCENE_XML = Path(__file__).parent / "scene.xml"

@@ -1,4 +1,4 @@
-"""The layers of `rotorgram bench`, beside other simulators of drones that are installed here.
+"""The layers of `studies/bench.py`, beside other simulators of drones that are installed here.
 
     pip install l2f hyperdrone crazyflow
     python studies/beside.py
@@ -16,8 +16,8 @@ from time import process_time
 
 import gymnasium as gym
 import numpy as np
+from bench import DRONES, LAYERS, Layer, Step, actions, bench, keep
 from measuring import RESULTS, options
-from rotorgram.training.bench import DRONES, LAYERS, Layer, Step, actions, bench
 
 
 def l2f(_: ExitStack) -> Step:
@@ -88,7 +88,8 @@ OTHERS = {
 def main() -> None:
     args = options(__doc__, rounds=7, seconds=0.5, out=RESULTS / "performance").parse_args()
     found = [layer for package, layer in OTHERS.items() if find_spec(package)]
-    measured = bench([*LAYERS, *found], args.rounds, args.seconds, args.out, lambda *_: None)
+    measured = bench([*LAYERS, *found], args.rounds, args.seconds)
+    keep(measured, args.rounds, args.seconds, args.out)
     for name, rate in measured.medians.items():
         print(f"{name:20} {rate:14,.0f}")
 

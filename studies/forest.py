@@ -23,8 +23,7 @@ from typing import Any
 
 import numpy as np
 from measuring import RESULTS, options, write
-from rotorgram.agents import load
-from rotorgram.agents.vfh import Vfh
+from rotorgram.agents import find_controller, load
 from rotorgram.envs import LocalVectorEnv
 from rotorgram.envs.config import EnvConfig
 from rotorgram.envs.spec import EnvSpec
@@ -80,8 +79,9 @@ def fly(policy: Any, flights: int, density: float, speed: float, seed: int) -> d
 
 def fly_vfh(flights: int, density: float, speed: float) -> dict[str, Any]:
     """The same of VFH+, all drones at once, in the layouts of `straight`."""
-    env = woods(flights, density, speed, **Vfh.options)
-    pilot = Vfh(env.env_spec)
+    vfh: Any = find_controller("examples/vfh.py:Vfh")
+    env = woods(flights, density, speed, **vfh.options)
+    pilot = vfh(env.env_spec)
     env.reset(seed=[evaluation_seed(number, "final", 0) for number in range(flights)])
     nobody = done = np.zeros(flights, bool)
     last = env.telemetry["metrics"]

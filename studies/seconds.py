@@ -27,7 +27,7 @@ from typing import Any
 
 import numpy as np
 from measuring import RESULTS, options, write
-from rotorgram.agents import CONTROLLERS, load
+from rotorgram.agents import find_controller, load
 from rotorgram.envs import LocalVectorEnv
 from rotorgram.flights.trajectories import fly_episodes
 from rotorgram.training.metrics import Headline, steady_state
@@ -57,11 +57,11 @@ def evaluate(
     """Of a `Checkpoint`, or of a controller by its name: steady size of the headline metric and
     return, means over episodes; crashes; the verdict. The starts are those of the training's seed.
     """
-    options = CONTROLLERS[agent].options if isinstance(agent, str) else agent.options
+    options = find_controller(agent).options if isinstance(agent, str) else agent.options
     env = LocalVectorEnv(env_id, episodes, autoreset_mode="Disabled", vehicle=vehicle,
                               **options)  # fmt: skip
     spec = env.env_spec
-    policy = CONTROLLERS[agent](spec) if isinstance(agent, str) else agent.policy(spec)
+    policy = find_controller(agent)(spec) if isinstance(agent, str) else agent.policy(spec)
     flown = fly_episodes(env, policy, episodes, "final", training_seed=seed)
     env.close()
     headline = replace(Headline.of(spec), held=within)
@@ -80,7 +80,7 @@ def evaluate(
 def main() -> None:
     parser = options(__doc__, seeds=20, first_seed=100, episodes=20, within=0.05, vehicle=str,
                      out=RESULTS / "seconds.json")  # fmt: skip
-    parser.add_argument("--beside", choices=sorted(CONTROLLERS), nargs="+", default=[],
+    parser.add_argument("--beside", nargs="+", default=[],
                         help="controllers that fly the same starts")  # fmt: skip
     parser.add_argument("words", nargs="*", default=["ppo"])
     args = parser.parse_args()

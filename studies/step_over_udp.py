@@ -16,10 +16,10 @@ import sys
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 
+from bench import ENV_ID, Step, local_env, rate_of, single_step
 from measuring import in_turns, medians, options
 from rotorgram.envs.config import EnvConfig
 from rotorgram.envs.registry import env_spec
-from rotorgram.training.bench import ENV_ID, Step, local_env, rate_of, single_step
 from rotorgram.udp.layouts import layout_of
 from rotorgram.udp.spawn import spawn_simulator
 

@@ -89,12 +89,8 @@ def synthetic_folder(
 
 def _steps(phase: str, episode: int, first: int, errors: np.ndarray) -> pd.DataFrame:
     step = np.arange(first, first + len(errors)) + 1
-    numbers = {
-        "value": errors.astype(np.float32),
-        "reward": np.float32(0),
-        "thrust": np.float32(49),
-    }
-    return pd.DataFrame({"phase": phase, "episode": episode, "step": step, **numbers})
+    value = errors.astype(np.float32)
+    return pd.DataFrame({"phase": phase, "episode": episode, "step": step, "value": value})
 
 
 def _trained(

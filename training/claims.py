@@ -14,13 +14,15 @@ than SB3's, is shown by a margin of non-inferiority: the whole interval of the d
 on the good side of it.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Literal
 
 import numpy as np
 from pandas import DataFrame, Series
 
+from ..models.files import read_toml
 from .metrics import Headline, episode_ends, mean_returns, training_runs
 from .statistics import Floats, bootstrap_difference, iqm, share_interval
 from .tables import seeds_text
@@ -42,8 +44,6 @@ MARGIN_SHARE = 0.2
 """Margin of non-inferiority, as a share of the bound below which a goal counts as held. Ours: for
 the elevation task 0.02 m, a hundredth of the craft's width and far above what its agents differ by.
 """
-OURS = "A claim of this software, not of the paper"
-
 MIN_EPISODES = 10
 """Training episodes below which a run's curve says nothing."""
 CONVERGENCE_BAND = 0.1
@@ -60,6 +60,17 @@ FLUCTUATION_WINDOW = 11
 _GRID = 100
 
 _TOO_FEW = f"fewer than {MIN_SEEDS} seeds with a value decide nothing"
+_TEXTS = read_toml(Path(__file__).parent / "assets" / "claims.toml", "claims")
+_NUMBERS = {
+    "smoothing": 100 * SMOOTHING_SHARE,
+    "band": 100 * CONVERGENCE_BAND,
+    "rise": LEARNING_RISE,
+    "window": FLUCTUATION_WINDOW,
+    "share": HOLDING_SHARE,
+    "interval": _INTERVAL,
+    "seeds": MIN_SEEDS,
+    "margin_share": MARGIN_SHARE,
+}
 
 Outcome = Literal["borne out", "not borne out", "undecided", "not tested"]
 _Judged = tuple[Outcome, str]
@@ -69,15 +80,15 @@ _Judged = tuple[Outcome, str]
 class Verdict:
     """The verdict on one claim of the paper."""
 
+    verdict: Outcome
+    evidence: str
+    """The numbers."""
     claim: str
     """With the paper's words."""
     source: str
     """Place in the paper."""
     definition: str
     """Of its measure and of the decision."""
-    verdict: Outcome
-    evidence: str
-    """The numbers."""
 
 
 def _late_returns(run: DataFrame, returns: Series) -> Series:
@@ -126,89 +137,79 @@ def fluctuation(run: DataFrame) -> float:
     return float(_late_returns(run, run["return"] - moving).std())
 
 
+# ---- verdicts
+
+
 def judge_claims(episodes: DataFrame, runs: DataFrame, headline: Headline) -> list[Verdict]:
     """Judge the paper's four claims from the tables `episodes` and `runs` of `results`."""
-    return [
-        Verdict(*_CONVERGES, *_compare(episodes, convergence_step, True, _LATER)),
-        Verdict(*_REWARD, *_compare(episodes, long_run_return, True)),
-        Verdict(*_FLUCTUATES, *_compare(episodes, fluctuation, False)),
-        Verdict(*_holding_claim(headline), *_both_hold(runs, headline)),
-    ]
+    converges = _compare(episodes, convergence_step, True, " env steps", "did not converge")
+    judged = {
+        "converges": converges,
+        "reward": _compare(episodes, long_run_return, True),
+        "fluctuates": _compare(episodes, fluctuation, False),
+        "holds": _both_hold(runs, headline),
+    }
+    return [_verdict(name, headline, outcome) for name, outcome in judged.items()]
 
 
-_CONVERGES = (
-    "A2C converges later than VPG: it “takes much more episodes to converge”.",
-    "Section 3, Figure 6 (“A2C converge slower than VPG”)",
-    f"Convergence: the env step from which the training return, averaged over "
-    f"{100 * SMOOTHING_SHARE:.0f} % of training, stays within {100 * CONVERGENCE_BAND:.0f} % of "
-    "its own range around its final level. A run that does not raise this average, from the first "
-    f"tenth of training to the last, by more than {LEARNING_RISE:g} times its standard deviation "
-    "in the last quarter did not converge and is left out. Env steps are compared, not episodes, "
-    "because crashes make episodes of unequal length.",
-)
-_REWARD = (
-    "A2C's long-run average reward is higher: it “can reach to higher average reward”.",
-    "Section 3, Figures 6 and 7 (“A2C outperform the VPG on the long run”)",
-    "Long run: the mean return of the episodes in the last quarter of training.",
-)
-_FLUCTUATES = (
-    "A2C fluctuates less than VPG: “with much more stability”, “with minimum fluctuation”.",
-    "Section 3, Figures 6 and 8",
-    "Fluctuation: the standard deviation of the episode return around its centred moving average "
-    f"over {FLUCTUATION_WINDOW} episodes, in the last quarter of training.",
-)
-_LATER = (" env steps", "did not converge")
+def judge_no_worse(runs: DataFrame, headline: Headline) -> Verdict:
+    """Judge whether our A2C is no worse than SB3's after as many env steps, from the table `runs`.
+    The headline metric has a bound of its goal.
+    """
+    return _verdict("no_worse", headline, _no_worse(runs, headline))
 
 
-def _holding_claim(headline: Headline) -> tuple[str, str, str]:
-    return (
-        "Both agents hold the target: “both implemented algorithms achieve high stability, by "
-        "achieving convergence to the required performance”.",
-        "Abstract; section 3, Figure 8",
-        f"Holding: the steady state (mean {headline.size_symbol} over the last quarter of each "
-        f"episode) of a seed's final deterministic evaluation fulfils {headline.held_text}, and no "
-        f"episode of it crashes. Each agent holds in at least {HOLDING_SHARE:.0%} of its seeds, by "
-        f"Wilson's {_INTERVAL} of the share. Fewer than {MIN_SEEDS} seeds decide nothing.",
-    )
+def _verdict(name: str, headline: Headline, judged: _Judged) -> Verdict:
+    """With the texts of a claim."""
+    margin = headline.amount(_number(_margin(headline)))
+    words = {"size": headline.size_symbol, "held": headline.held_text, "margin": margin}
+    texts = {key: text.format(**_NUMBERS, **words) for key, text in _TEXTS[name].items()}
+    return Verdict(*judged, **texts)
+
+
+def _margin(headline: Headline) -> float:
+    return MARGIN_SHARE * (headline.held or np.nan)
 
 
 def _compare(
     episodes: DataFrame,
     measure: Callable[[DataFrame], float],
     larger: bool,
-    words: tuple[str, str] = ("", ""),
+    unit: str = "",
+    without: str = "",
 ) -> _Judged:
     """Judge a claim that A2C's measure of a run is larger (or smaller) than VPG's; the numbers.
 
-    The words are the unit, after a space, and why a run that is long enough has no number.
+    `without` says why a run that is long enough has no number.
     """
     runs = {name: training_runs(episodes, name.lower()) for name in ("A2C", "VPG")}
     missing = [name for name, own in runs.items() if not own]
     if missing:
         return "not tested", _untrained(missing)
-    values = {name: np.array([measure(run) for run in own]) for name, own in runs.items()}
-    parts = [_measured(name, values[name], own, words) for name, own in runs.items()]
+    values: list[Floats] = []
+    parts = []
+    for name, own in runs.items():
+        numbers = np.array([measure(run) for run in own])
+        known = np.isfinite(numbers)
+        details = _seeds(int(known.sum()), len(own))
+        failed = sum(len(run) >= MIN_EPISODES for run in own) - int(known.sum())
+        if without and failed:
+            details += f", {failed} {without}"
+        parts.append(f"{name} {_number(iqm(numbers))}{unit if known.any() else ''} ({details})")
+        values.append(numbers)
     evidence = f"{', '.join(parts)}; "
-    if min(np.isfinite(numbers).sum() for numbers in values.values()) < MIN_SEEDS:
+    if _are_few(values):
         return "undecided", f"{evidence}{_TOO_FEW}."
-    difference, low, high = bootstrap_difference(values["A2C"], values["VPG"], level=LEVEL)
-    evidence += f"difference {_number(difference)}, {_INTERVAL} {_range(low, high)}"
+    difference, low, high = bootstrap_difference(values[0], values[1], LEVEL)
+    evidence += f"difference {_number(difference)}, {_INTERVAL} {_range(low, high)}."
     if low <= 0.0 <= high:
-        return "undecided", f"{evidence}."
-    agrees = (low > 0.0) == larger
-    outcome: Outcome = "borne out" if agrees else "not borne out"
-    return outcome, f"{evidence}."
+        return "undecided", evidence
+    return "borne out" if (low > 0.0) == larger else "not borne out", evidence
 
 
-def _measured(name: str, numbers: Floats, runs: list[DataFrame], words: tuple[str, str]) -> str:
-    unit, without = words
-    known = np.isfinite(numbers)
-    long = np.array([len(run) >= MIN_EPISODES for run in runs])
-    text = _seeds(int(known.sum()), len(numbers))
-    failed = int((long & ~known).sum())
-    if without and failed:
-        text += f", {failed} {without}"
-    return f"{name} {_number(iqm(numbers))}{unit if known.any() else ''} ({text})"
+def _are_few(values: Sequence[Floats]) -> bool:
+    """Whether an agent has too few seeds with a value."""
+    return min(int(np.isfinite(numbers).sum()) for numbers in values) < MIN_SEEDS
 
 
 def _both_hold(runs: DataFrame, headline: Headline) -> _Judged:
@@ -244,24 +245,7 @@ def _holds(runs: DataFrame, headline: Headline) -> _Judged:
     return "undecided", text
 
 
-def judge_no_worse(runs: DataFrame, headline: Headline) -> Verdict:
-    """Judge whether our A2C is no worse than SB3's after as many env steps, from the table `runs`.
-    The headline metric has a bound of its goal.
-    """
-    margin = MARGIN_SHARE * (headline.held or np.nan)
-    claim = (
-        "Our A2C is no worse than Stable-Baselines3's after as many env steps.",
-        OURS,
-        "No worse: of the interquartile means of the steady "
-        f"{headline.size_symbol} in the final deterministic evaluation, that of our A2C minus that "
-        f"of SB3's lies on the better side of a margin of {headline.amount(_number(margin))} with "
-        f"its whole 95 % interval, and no smaller share of its seeds holds. The margin is ours: "
-        f"{MARGIN_SHARE:.0%} of the bound for holding the goal. It says nothing of other measures.",
-    )
-    return Verdict(*claim, *_no_worse(runs, margin, headline))
-
-
-def _no_worse(runs: DataFrame, margin: float, headline: Headline) -> _Judged:
+def _no_worse(runs: DataFrame, headline: Headline) -> _Judged:
     both = {name: runs[runs["row"] == name] for name in ("a2c", "sb3-a2c")}
     missing = [name for name, own in both.items() if own.empty]
     if missing:
@@ -273,13 +257,14 @@ def _no_worse(runs: DataFrame, margin: float, headline: Headline) -> _Judged:
         f"A2C {_number(iqm(pair[0]))}, SB3 A2C {_number(iqm(pair[1]))}; difference "
         f"{headline.amount(_number(difference))}"
     )
-    if min(np.isfinite(values).sum() for values in pair) < MIN_SEEDS:
+    if _are_few(pair):
         return "undecided", f"{evidence}; {_TOO_FEW}."
     held = ours["held"].mean()
     their_held = theirs["held"].mean()
     evidence += f", 95 % interval {headline.amount(_range(low, high))}; "
     evidence += f"{held:.0%} of the seeds of A2C hold, {their_held:.0%} of SB3's."
     best, worst = (-high, -low) if headline.high else (low, high)
+    margin = _margin(headline)
     if best > margin:
         return "not borne out", evidence
     if worst < margin and held >= their_held:

@@ -25,7 +25,7 @@ from .metrics import (
     training_runs,
 )
 from .results import Results
-from .settings import Row, file_words
+from .settings import Row, file_words, short_name
 from .tables import by_task, row_label, seeds_text
 
 AVERAGING_SHARE = 0.05
@@ -84,7 +84,7 @@ def draw_figures(results: Results, table: DataFrame) -> list[str]:
 
 def row_color(row: Row) -> str:
     """Colour of a row: that of its agent, if the row is named as its agent."""
-    return agent_color(row.agent if row.name == row.agent else row.name)
+    return agent_color(row.agent if row.name == short_name(row.agent) else row.name)
 
 
 # ---- rows beside each other

@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from ..agents import CONTROLLERS
+from ..agents import find_controller
 from ..agents.checkpoints import load
 from ..agents.policies import Policy
 from ..flights.executors import Tell
@@ -43,7 +43,7 @@ def film_study(results: Results, out: Path, tell: Tell = lambda *_: None) -> Non
         policy: Policy
         name = row_label(row)
         if row.controller:
-            policy = CONTROLLERS[row.agent](results.specs[row.name])
+            policy = find_controller(row.agent)(results.specs[row.name])
         else:
             policy = load(checkpoint_file(results.folder, row, seed)).policy()
             name += f", seed {seed}"

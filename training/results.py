@@ -68,8 +68,7 @@ COLUMNS: Final[Mapping[str, tuple[str, ...]]] = {
         "phase",  # "train" or "evaluation"
         "episode",  # within the run; -1: one that the end of training cut
         "step",  # of the run for train, of the episode for evaluation; from 1
-        "value", "reward",
-        "thrust",  # mean over the rotors, N
+        "value",
     ),
 }  # fmt: skip
 """Columns of each table.

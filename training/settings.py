@@ -10,7 +10,15 @@ from hashlib import blake2b
 from pathlib import Path
 from typing import Any, Literal
 
-from ..agents import ALGORITHMS, CONTROLLERS, Config, find_preset, preset
+from ..agents import (
+    ALGORITHMS,
+    CONTROLLERS,
+    Config,
+    find_controller,
+    find_preset,
+    is_controller,
+    preset,
+)
 from ..agents.presets import PresetName
 from ..envs.config import DEFAULT_ENV, EnvConfig, read_keywords
 from ..envs.registry import env_spec, load
@@ -70,7 +78,7 @@ class Row:
     """A row of a study: an agent on an env. A row of an algorithm has a training for each seed."""
 
     agent: str
-    """An algorithm, or a controller, which is not trained."""
+    """An algorithm, or a controller, which is not trained: `CONTROLLERS`, or FILE.py:CLASS."""
     name: str = ""
     """Unique in the study. Default: agent, preset, changes and env in words."""
     env: EnvConfig = field(default_factory=EnvConfig)
@@ -87,9 +95,12 @@ class Row:
     """Drones that fly at the same time in each training; 0: those of the preset."""
 
     def __post_init__(self) -> None:
-        known = (*CONTROLLERS, *ALGORITHMS)
-        if self.agent not in known:
-            raise InputError(f"agent: expected one of {', '.join(known)}, got {self.agent}")
+        if not (self.controller or self.agent in ALGORITHMS):
+            known = ", ".join((*CONTROLLERS, *ALGORITHMS))
+            raise InputError(
+                f"agent: expected one of {known}, or FILE.py:CLASS of a controller, "
+                f"got {self.agent}"
+            )
         check_fields(self)
         backend = self.env.backend.name
         if backend != "mujoco":
@@ -120,7 +131,7 @@ class Row:
     @property
     def default_name(self) -> str:
         """Name of a row that is given none."""
-        words = [self.agent]
+        words = [short_name(self.agent)]
         if not self.controller:
             words.append(self.preset)
         words += [f"{name}={_word(value)}" for name, value in self.set.items()]
@@ -146,12 +157,12 @@ class Row:
     @property
     def controller(self) -> bool:
         """Whether the agent is not trained."""
-        return self.agent in CONTROLLERS
+        return is_controller(self.agent)
 
     @property
     def brought(self) -> Mapping[str, object]:
         """Options of the env that a controller needs."""
-        return CONTROLLERS[self.agent].options if self.controller else {}
+        return find_controller(self.agent).options if self.controller else {}
 
     @property
     def config(self) -> Config:
@@ -190,6 +201,11 @@ class Row:
             return read_table(cls, given, "row")
         except InputError as error:
             raise InputError(f"{where}: {error}") from None
+
+
+def short_name(agent: str) -> str:
+    """An agent in one word: of a controller in a file, its class."""
+    return agent.rpartition(":")[2].lower()
 
 
 def file_words(text: str) -> str:

@@ -2,15 +2,16 @@
 
 from collections.abc import Sequence
 from contextlib import AbstractContextManager, closing
-from dataclasses import asdict, replace
+from dataclasses import fields, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
+from numpy.typing import ArrayLike
 
-from ..agents import CONTROLLERS
+from ..agents import Episode, find_controller
 from ..agents.checkpoints import Checkpoint, store
 from ..envs.autoreset import AdvancingVectorEnv
 from ..envs.config import EnvConfig
@@ -98,7 +99,7 @@ def _fly(study: Study, own_tasks: set[str], job: Job, tell: Tell) -> Done:
     for task in own_tasks:
         load(task)
     if row.controller:
-        policy = CONTROLLERS[row.agent](env_spec(row.env))
+        policy = find_controller(row.agent)(env_spec(row.env))
         times = {"env_steps": 0, "seconds": 0.0, "steps_per_second": np.nan}
         untrained = [Snapshot(env_steps=0, seconds=0.0, policy=policy)]
         return Done(_evaluate(study, row, seed, untrained, times), None)
@@ -158,34 +159,27 @@ def _evaluate(
     measures = {**times, **measure_run(evaluations, headline)}
     tables = {"runs": pd.DataFrame([measures]), "evaluations": evaluations}
     if study.keep_steps:
-        parts = []
-        for each in flown:
-            values = {"value": each.headline[1:], "thrust": each.mean_thrust[1:]}
-            parts.append(_steps("evaluation", episode=each.episode, reward=each.rewards, **values))
+        parts = [_steps("evaluation", one.episode, one.headline[1:]) for one in flown]
         tables["steps"] = pd.concat(parts, ignore_index=True)
     return tables
 
 
 def _episodes(training: Training) -> pd.DataFrame:
     log = training.log
-    run = training.run
-    rows = []
-    for episode in log.episodes:
-        # While one drone flies a step, each of the others does.
-        last = min(episode.first_step + episode.length * run.num_envs, log.env_steps)
-        content = asdict(episode)
-        content |= {"return": content.pop("total_reward"), "last_step": last}
-        rows.append(content)
-    return pd.DataFrame(rows, columns=list(results.COLUMNS["episodes"][2:]))
+    table = pd.DataFrame(log.episodes, columns=[field.name for field in fields(Episode)])
+    # While one drone flies a step, each of the others does.
+    last = table["first_step"] + table["length"] * log.num_envs
+    table = table.assign(last_step=last.clip(upper=log.env_steps))
+    table = table.rename(columns={"total_reward": "return"})
+    return table[list(results.COLUMNS["episodes"][2:])]
 
 
-def _steps(phase: str, **columns: Any) -> pd.DataFrame:
-    """Rows of the table `steps`: one value or shape (T,) for each column but `step`."""
-    count = len(columns["reward"])
-    floats = {name: np.asarray(columns[name], np.float32) for name in ("value", "reward", "thrust")}
+def _steps(phase: str, episode: ArrayLike, value: ArrayLike) -> pd.DataFrame:
+    """Rows of the table `steps`, from the headline metric after each, shape (T,)."""
+    values = np.asarray(value, np.float32)
     return pd.DataFrame({
         "phase": phase,
-        "episode": np.asarray(columns["episode"], np.int32),
-        "step": np.arange(1, count + 1, dtype=np.int32),
-        **floats,
+        "episode": np.asarray(episode, np.int32),
+        "step": np.arange(1, len(values) + 1, dtype=np.int32),
+        "value": values,
     })  # fmt: skip

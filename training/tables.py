@@ -12,7 +12,7 @@ from pandas import DataFrame
 from ..flights.palette import agent_label
 from .metrics import MEANS, Headline, Measures
 from .results import Results
-from .settings import Row
+from .settings import Row, short_name
 from .statistics import bootstrap_interval, iqm, share_interval
 
 Line = Mapping[str, float]
@@ -183,13 +183,10 @@ def seeds_text(count: int) -> str:
 
 def row_label(row: Row) -> str:
     """Name of a row in tables and figures."""
-    if row.name == row.agent:
-        return agent_label(row.agent)
-    words = f" {row.task}"
-    if row.name.endswith(words):  # its table names the task
-        agent, *others = row.name.removesuffix(words).split()
-        return " ".join([agent_label(agent), *others])
-    return row.name
+    first, *others = row.name.removesuffix(f" {row.task}").split()  # its table names the task
+    if first == short_name(row.agent):
+        first = agent_label(row.agent)
+    return " ".join([first, *others])
 
 
 def _held(line: Line, seeds: int) -> str:

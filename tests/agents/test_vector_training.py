@@ -80,10 +80,8 @@ def test_every_episode_has_the_seed_of_its_number() -> None:
 def test_kept_steps_are_those_of_the_episodes() -> None:
     log = EpisodeRecorder(vector(1), seed=5, keep_steps=True)
     dice = np.random.default_rng(1)
-    first_action = random_actions(dice, 1)
     log.start()
-    log.fly(first_action)
-    for _ in range(69):
+    for _ in range(70):
         if log.done[0]:
             log.begin(log.done)
         log.fly(random_actions(dice, 1))
@@ -94,9 +92,7 @@ def test_kept_steps_are_those_of_the_episodes() -> None:
     assert first.first_step == 0
     own = steps["episode"] == 0
     assert own.sum() == first.length
-    assert first.total_reward == pytest.approx(steps["reward"][own].sum(), rel=1e-5)
     assert first.mean_size == pytest.approx(np.abs(steps["value"][own]).mean(), rel=1e-5)
-    assert steps["thrust"][0] == pytest.approx(49 + 5 * first_action[0, 0], rel=1e-6)
 
 
 def test_a_step_for_sb3_is_gymnasiums_same_step() -> None:

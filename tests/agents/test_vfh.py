@@ -4,11 +4,11 @@ from typing import Any
 
 import numpy as np
 import pytest
-from rotorgram.agents.vfh import SECTORS, Vfh, candidates, histogram, masked, seen
 from rotorgram.envs import LocalVectorEnv
 from rotorgram.envs.config import EnvConfig
 from rotorgram.envs.registry import env_spec
 from rotorgram.models import InputError
+from vfh import SECTORS, Vfh, candidates, histogram, masked, seen
 
 FOREST = "rotorgram/Forest-v0"
 UP = np.array([[0.0], [0.0], [1.0]])

@@ -63,4 +63,7 @@ def test_what_is_no_task(tmp_path: Path, capsys: Capsys) -> None:
     assert "expected a file of Python" in refused(capsys, "check-task", "nowhere.py:Mine")
     (tmp_path / "mine.py").write_text(HEAD)
     told = refused(capsys, "check-task", f"{tmp_path / 'mine.py'}:Other")
+    assert "expected a class of" in told
+    (tmp_path / "other.py").write_text("class Other:\n    pass\n")
+    told = refused(capsys, "check-task", f"{tmp_path / 'other.py'}:Other")
     assert "expected a class derived from Task" in told

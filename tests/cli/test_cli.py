@@ -45,6 +45,7 @@ from rotorgram.udp import Simulator
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 SWARM = ("--env", "rotorgram/Formation-v0", "--drones", "2")
+ORCA = f"{Path(__file__).parents[2]}/examples/orca.py:Orca"
 
 
 @pytest.fixture(autouse=True)
@@ -436,7 +437,7 @@ def test_worlds_of_the_simulator_that_comes(tmp_path: Path, capsys: Capsys) -> N
     swarm = ("sim", *SWARM, "--num-envs", 4, "--server", here, "--bind", "127.0.0.1:0")
     flags = ("--env", "rotorgram/Formation-v0", "--listen", here)
     simulator = start(*swarm)
-    err = refused(capsys, "evaluate", "orca", *flags, "--drones", 4, "--episodes", 1)
+    err = refused(capsys, "evaluate", ORCA, *flags, "--drones", 4, "--episodes", 1)
     assert err == "rotorgram: drones: expected a simulator of 4 in each world, got one of 2\n"
     assert "the agent closed" in simulator.communicate(timeout=10)[0]
     simulator = start(*swarm)

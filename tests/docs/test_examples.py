@@ -10,6 +10,7 @@ import pytest
 from programs import EXAMPLES, free_port, rotorgram, run
 
 SHORT = {
+    "find_path.py": ([], r"^\d\d+ points, \d\d\.\d m$"),
     "fly_pid.py": ([], r"return 2\d\d\.\d, elevation 6\.000 m of 6\.0 m"),
     "mpc.py": (["--steps", "75"], r"step 75: 0\.[0-2]\d\d m from the goal"),
     "ppo_loop.py": (["--updates", "2"], r"update 2: 4,096 steps, return -?\d+\.\d"),
@@ -58,7 +59,8 @@ def test_the_detector_learns_from_pictures(opengl: None, tmp_path: Path) -> None
 
 def test_every_script_is_run() -> None:
     scripts = {path.name for path in EXAMPLES.glob("*.py")}
-    others = {"text_agent.py", "pad_detector.py", "landing.py"}  # its tests: test_own_task.py
+    # Tests of the last three: test_own_task.py, test_swarm_tasks.py, test_vfh.py.
+    others = {"text_agent.py", "pad_detector.py", "landing.py", "orca.py", "vfh.py"}
     assert scripts == {*SHORT, *others}
     page = (EXAMPLES / "README.md").read_text()
     assert all(f"({script})" in page for script in scripts)

@@ -123,7 +123,7 @@ def imported(*arguments: str) -> set[str]:
 @pytest.mark.parametrize("command", COMMANDS)
 def test_flags_are_checked_before_anything_heavy_is_imported(command: str) -> None:
     heavy = {"mujoco", "torch", "pandas", "matplotlib", "stable_baselines3", "ray", "scipy"}
-    if command in ("key", "replay", "report", "bench"):
+    if command in ("key", "replay", "report"):
         heavy.add("gymnasium")
     packages = imported(command, "--wrong-flag")
     assert not packages & heavy

@@ -6,9 +6,8 @@ from typing import Any
 import numpy as np
 import pytest
 from contracts import TABLES, spec_with, zero_actions
+from orca import Orca, avoiding, nearest
 from pettingzoo.test import parallel_api_test, parallel_seed_test
-from rotorgram.agents import Orca
-from rotorgram.agents.orca import avoiding, nearest
 from rotorgram.envs import LocalVectorEnv
 from rotorgram.envs.memory import Memory
 from rotorgram.envs.parallel import LocalParallelEnv

@@ -6,7 +6,7 @@ from itertools import permutations
 
 import numpy as np
 import pytest
-from rotorgram.agents import Orca
+from orca import Orca
 from rotorgram.envs import LocalVectorEnv
 from rotorgram.envs.config import EnvConfig
 from rotorgram.flights.trajectories import fly_episodes

@@ -9,6 +9,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import rotorgram.envs  # noqa: F401
+from find_path import find_path
 from rotorgram.envs.config import EnvConfig
 from rotorgram.models import InputError
 from rotorgram.scenes import (
@@ -17,7 +18,6 @@ from rotorgram.scenes import (
     SceneConfig,
     SceneType,
     Solids,
-    find_path,
     register,
     seeded_scenes,
 )

@@ -1,4 +1,4 @@
-"""`rotorgram bench`: every layer is measured; and what a step over UDP is compared with."""
+"""`studies/bench.py`: every layer is measured; and what a step over UDP is compared with."""
 
 import json
 import os
@@ -8,8 +8,7 @@ import sys
 from pathlib import Path
 
 import pytest
-from rotorgram.cli import main
-from rotorgram.training.bench import LAYERS, bench
+from bench import LAYERS, bench
 from step_over_udp import multiple, one_core
 
 
@@ -29,25 +28,25 @@ def test_the_echo_shares_the_core_of_its_client() -> None:  # fault 68
         process.communicate(b"\n")
 
 
-def test_every_layer_is_measured(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    folder = tmp_path / "bench"
-    assert main(["bench", "--rounds", "3", "--seconds", "0.01", "--out", str(folder)]) == 0
-    written = json.loads((folder / "bench.json").read_text())
+def test_every_layer_is_measured(tmp_path: Path) -> None:
+    script = Path(__file__).parents[2] / "studies" / "bench.py"
+    words = [sys.executable, script, "--rounds", "3", "--seconds", "0.01", "--out", tmp_path]
+    shown = subprocess.run(words, capture_output=True, text=True, check=True).stdout
+    written = json.loads((tmp_path / "bench.json").read_text())
     names = [layer.name for layer in LAYERS]
     assert list(written["rates"]) == names
     for name, rates in written["rates"].items():
         assert len(rates) == 3
         assert min(rates) > 0
         assert written["medians"][name] == statistics.median(rates)
-    shown = capsys.readouterr().out
     assert all(name in shown for name in names)
     assert f"{written['policy_seconds']:.2f} s of one core" in shown
 
 
-def test_wrong_times(tmp_path: Path) -> None:
+def test_wrong_times() -> None:
     for rounds, seconds, sentence in (
         (0, 1.0, "rounds: expected a whole number of at least 1, got 0"),
         (1, 0.0, "seconds: expected a number above 0, at most 60 s, got 0"),
     ):
         with pytest.raises(ValueError, match=sentence):
-            bench(LAYERS, rounds, seconds, tmp_path, lambda *_: None)
+            bench(LAYERS, rounds, seconds)

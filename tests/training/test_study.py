@@ -27,6 +27,7 @@ from rotorgram.training.results import Results, ResultsError, checkpoint_file
 from rotorgram.training.settings import BOARD, Row, Study
 from rotorgram.training.study import open_env, run_study
 
+SWARMS = Path(__file__).parents[2] / "studies" / "swarms.toml"
 ENV = EnvConfig(episode_length=40, task={"flight_band": 1.2})
 A2C = Row(agent="a2c", name="a2c", env=ENV, env_steps=600, set={"steps_per_update": 64})
 STUDY = Study(
@@ -209,7 +210,7 @@ def test_two_files_are_rows_of_their_names(tmp_path: Path, capsys: Capsys) -> No
 
 
 def test_a_study_is_read_back_from_its_json() -> None:
-    for study in (STUDY, Study.from_toml(BOARD), Study.from_toml(BOARD.with_name("swarms.toml"))):
+    for study in (STUDY, Study.from_toml(BOARD), Study.from_toml(SWARMS)):
         content = json.loads(json.dumps(study.to_dict()))
         assert Study.from_dict("here", content) == study
 
@@ -371,10 +372,12 @@ def test_a_table_that_is_no_table_is_one_sentence(tmp_path: Path) -> None:
 def test_our_own_rows_are_right() -> None:
     study = Study.from_toml(BOARD)
     assert {"vpg", "a2c", "sb3-a2c", "pid"} <= {row.agent for row in study.rows}
-    swarms = Study.from_toml(BOARD.with_name("swarms.toml"))
+    swarms = Study.from_toml(SWARMS)
     assert swarms.seeds == 5
     assert {row.env.drones for row in swarms.rows} == {2, 4, 8}
-    assert {"ippo", "mappo", "sb3-ppo", "orca"} == {row.agent for row in swarms.rows}
+    assert {"ippo", "mappo", "sb3-ppo", "examples/orca.py:Orca"} == {
+        row.agent for row in swarms.rows
+    }
 
 
 def test_the_committed_policies_fly_the_committed_numbers() -> None:

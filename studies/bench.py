@@ -1,11 +1,16 @@
 """Env steps per second on this machine, from raw physics to a simulator over UDP.
 
+    python studies/bench.py [--out FOLDER]
+
 `rigid` counts seconds of the processor, so that threads bring nothing: steps per second of one
 core. All layers are open at the same time and take turns to run for a moment; the median over the
-turns counts, so that a machine that slows down for a while slows all alike.
-`studies/beside.py` adds layers of other simulators.
+turns counts, so that a machine that slows down for a while slows all alike. Prints the medians;
+with `--out`, `bench.json` there has all rates. `studies/beside.py` adds other simulators.
+
+It takes about two minutes on two cores.
 """
 
+import logging
 import os
 import statistics
 import subprocess
@@ -22,19 +27,16 @@ from typing import NamedTuple
 import gymnasium as gym
 import mujoco
 import numpy as np
+from measuring import options, table, write
 from mujoco.batch import Batch
 from numpy.typing import NDArray
-
-from ..envs.autoreset import AdvancingVectorEnv
-from ..envs.config import EnvConfig
-from ..envs.vector import LocalVectorEnv
-from ..flights.executors import OnProgress
-from ..models.fields import Limits, check
-from ..models.files import software_versions, write_json
-from ..models.vehicle import Vehicle
-from ..udp.spawn import spawn_simulator
-from ..udp.transport.stepped import GymEnv
-from .results import machine
+from rotorgram.envs.autoreset import AdvancingVectorEnv
+from rotorgram.envs.config import EnvConfig
+from rotorgram.envs.vector import LocalVectorEnv
+from rotorgram.models.fields import Limits, check
+from rotorgram.models.vehicle import Vehicle
+from rotorgram.udp.spawn import spawn_simulator
+from rotorgram.udp.transport.stepped import GymEnv
 
 ENV_ID = "rotorgram/Elevation-v0"
 HOVER = "rotorgram/Hover-v0"
@@ -49,10 +51,15 @@ Step = Callable[[], int]
 class Measured(NamedTuple):
     """What `bench` found."""
 
-    medians: dict[str, float]
-    """Env steps per second by the name of the layer."""
+    rates: dict[str, list[float]]
+    """Env steps per second in each turn, by the name of the layer."""
     policy_seconds: float | None
     """Processor time of a training, s; None where its packages are missing."""
+
+    @property
+    def medians(self) -> dict[str, float]:
+        """Median rate of each layer."""
+        return {name: statistics.median(values) for name, values in self.rates.items()}
 
 
 class Layer(NamedTuple):
@@ -66,43 +73,30 @@ class Layer(NamedTuple):
     clock: Callable[[], float] = perf_counter
 
 
-def bench(
-    layers: Sequence[Layer], rounds: int, seconds: float, folder: Path, on_progress: OnProgress
-) -> Measured:
-    """Measure every layer in turns of `seconds`, and write `bench.json` into `folder`.
+def bench(layers: Sequence[Layer], rounds: int, seconds: float) -> Measured:
+    """Measure every layer in turns of `seconds`, after one round that warms up.
 
-    `on_progress` is called before each turn. Raises `InputError`.
+    Raises `InputError`.
     """
     check("rounds", Limits(1, whole=True), rounds)
     check("seconds", Limits(0, 60, "s", above=True), seconds)
-    turns = (rounds + 1) * len(layers)
-    done = 0
     rates: dict[str, list[float]] = {layer.name: [] for layer in layers}
     with ExitStack() as stack:
-        steps = {}
-        for layer in layers:
-            on_progress("bench", done, turns, f"opening {layer.name}")
-            steps[layer.name] = layer.start(stack)
+        steps = {layer.name: layer.start(stack) for layer in layers}
         for number in range(rounds + 1):
             for layer in layers:
-                on_progress("bench", done, turns, layer.name)
-                done += 1
                 at_once = _STEPS_AT_ONCE if layer.drones == 1 else 1
                 rate = rate_of(steps[layer.name], seconds, at_once, layer.clock)
-                if number:  # the first round warms up
+                if number:
                     rates[layer.name].append(round(rate, 1))
-    medians = {name: statistics.median(values) for name, values in rates.items()}
-    measured = Measured(medians, policy_seconds() if find_spec("safetensors") else None)
-    content = {
-        "rounds": rounds,
-        "seconds": seconds,
-        "rates": rates,
-        **measured._asdict(),
-        "machine": machine(),
-        "versions": software_versions(),
-    }
-    write_json(folder / "bench.json", content)
-    return measured
+    return Measured(rates, policy_seconds() if find_spec("safetensors") else None)
+
+
+def keep(measured: Measured, rounds: int, seconds: float, folder: Path) -> None:
+    """Write `bench.json` into a folder."""
+    result = {"rounds": rounds, "seconds": seconds, "rates": measured.rates}
+    result |= {"medians": measured.medians, "policy_seconds": measured.policy_seconds}
+    write(folder / "bench.json", result)
 
 
 def policy_seconds() -> float:
@@ -253,3 +247,22 @@ LAYERS = (
     Layer("rigid, 1024", "the same", DRONES, _rigid(DRONES), process_time),
     Layer("rigid, 4096", "the same", 4096, _rigid(4096), process_time),
 )
+
+
+def main() -> None:
+    args = options(__doc__, rounds=7, seconds=0.5, out=Path).parse_args()
+    logging.getLogger("rotorgram").setLevel(logging.WARNING)  # no counters of every wire
+    measured = bench(LAYERS, args.rounds, args.seconds)
+    rows = []
+    for layer in LAYERS:
+        rate = measured.medians[layer.name]
+        rows.append([layer.name, layer.about, f"{rate:,.0f}", f"{1e6 / rate:.2f}"])
+    print(table(["layer", "what", "env steps/s", "µs per env step"], rows))
+    if measured.policy_seconds:
+        print(f"rotorgram train ppo --env {HOVER}: {measured.policy_seconds:.2f} s of one core")
+    if args.out:
+        keep(measured, args.rounds, args.seconds, args.out)
+
+
+if __name__ == "__main__":
+    main()

@@ -2,18 +2,19 @@
 
 J. van den Berg, S. J. Guy, M. Lin and D. Manocha, "Reciprocal n-Body Collision Avoidance",
 Robotics Research, STAR 70, Springer 2011, in three dimensions.
+
+    rotorgram evaluate examples/orca.py:Orca --env rotorgram/Crossing-v0 --drones 8
 """
 
+from collections.abc import Mapping
 from math import hypot, sqrt
 from typing import ClassVar
 
 import numpy as np
-
-from ..envs.spec import EnvSpec
-from ..models.errors import InputError
-from .geometric import level_action
-from .layers import Floats
-from .policies import Observation, flat
+from rotorgram.agents.geometric import level_action
+from rotorgram.agents.policies import Array, Observation, flat
+from rotorgram.envs import EnvSpec
+from rotorgram.models import InputError
 
 HORIZON = 3.0  # Time ahead for which nothing may touch, s
 ROOM = 1.15  # Spheres are taken for larger, since a velocity is not reached at once
@@ -39,8 +40,8 @@ class Orca:
     `InputError` for an env that lacks what it needs.
     """
 
-    label = "ORCA"
-    options: ClassVar[dict[str, str]] = {"action": "velocity"}
+    label: ClassVar[str] = "ORCA"
+    options: ClassVar[Mapping[str, object]] = {"action": "velocity"}
     """Options of the env that it flies."""
 
     def __init__(self, spec: EnvSpec) -> None:
@@ -68,7 +69,7 @@ class Orca:
     def reset(self) -> None:
         """Nothing of an episode is kept."""
 
-    def act(self, observation: Observation) -> Floats:
+    def act(self, observation: Observation) -> Array:
         """Velocity and yaw rate as the env's action, float32, shape (4,)."""
         numbers = flat(observation, self._spec).astype(np.float64).tolist()
 

@@ -1,14 +1,18 @@
-"""Measures of flights among solids, and how hard a layout is."""
+"""How hard a layout is, and what `evaluate` prints of flights among solids."""
+
+from pathlib import Path
 
 import numpy as np
 import pytest
+from commands import Capsys, output
 from rotorgram.envs.config import EnvConfig
-from rotorgram.flights.surroundings import Passage
-from rotorgram.flights.trajectories import flown_trajectories
+from rotorgram.flights.trajectories import flown_trajectories, mean_traversability
 from rotorgram.models import InputError
 from rotorgram.scenes import Solids
 from rotorgram.scenes.config import SceneConfig
 from rotorgram.scenes.generators import Draft
+
+VFH = f"{Path(__file__).parents[2]}/examples/vfh.py:Vfh"
 
 
 def walls() -> Solids:
@@ -49,34 +53,26 @@ def test_no_room_is_0_and_a_radius_has_limits() -> None:
         walls().traversability(0.0, (0, 0, 1), (1, 1, 1))
 
 
-def test_flights_over_bare_ground_have_no_passage() -> None:
-    config = EnvConfig.from_keywords("rotorgram/Hover-v0", backend="rigid", episode_length=5)
-    assert Passage.of(flown_trajectories(None, config, [0])) is None
+def test_layouts_of_flights() -> None:
+    bare = EnvConfig.from_keywords("rotorgram/Hover-v0", backend="rigid", episode_length=5)
+    assert np.isnan(mean_traversability(flown_trajectories(None, bare, [0])))
+    scene = "forest:5,density=0.1,size=30x30"
+    config = EnvConfig.from_keywords("rotorgram/Hover-v0", scene=scene, episode_length=5)
+    flights = flown_trajectories(None, config, [0, 1])
+    radius = flights[0].spec.constants["radius"]
+    height = [one.telemetry["position"][0, 2] for one in flights]
+    wood = Solids.of_scene(scene).standing()
+    expected = [wood.traversability(radius, (-15, -15, z), (15, 15, z)) for z in height]
+    assert mean_traversability(flights) == pytest.approx(sum(expected) / 2)
+    assert 1.0 < sum(expected) / 2 < 100.0
 
 
-def test_a_passage_by_hand() -> None:
-    config = EnvConfig.from_keywords("rotorgram/Forest-v0", backend="rigid", episode_length=8)
-    (flight,) = flown_trajectories(None, config, [0])
-    passage = Passage.of([flight])
-    assert passage is not None
-    speeds = np.linalg.norm(flight.telemetry["velocity"], axis=1)
-    assert passage.time == pytest.approx(0.4)
-    assert passage.mean_speed == pytest.approx(speeds[1:].mean())
-    assert passage.top_speed == pytest.approx(speeds.max())
-    names = [metric.name for metric in flight.spec.metrics]
-    told = flight.telemetry["metrics"][-1, names.index("least_clearance")]
-    assert passage.least_clearance == pytest.approx(told, abs=1e-3)  # the task leaves out the start
-    assert passage.touched == 0.0
-    assert 5.0 < passage.traversability < 100.0
-
-
-def test_clearance_is_that_of_solids_where_they_are() -> None:
-    config = EnvConfig.from_keywords("rotorgram/Dodge-v0", backend="rigid", episode_length=70)
-    (flight,) = flown_trajectories(None, config, [0])
-    passage = Passage.of([flight])
-    assert passage is not None
-    names = [metric.name for metric in flight.spec.metrics]
-    told = flight.telemetry["metrics"][-1, names.index("least_clearance")]
-    assert passage.least_clearance == pytest.approx(told, abs=1e-4)
-    still = Solids.of_layout(flight.scene, flight.scene.seed).distance(flight.pose[:, :3])
-    assert abs(still.min() - flight.spec.constants["radius"] - told) > 0.1
+def test_what_evaluate_prints(capsys: Capsys) -> None:
+    scene = ("--scene", "forest:unseen,density=0.1,size=34x16,clear=ends")
+    words = ("--env", "rotorgram/Forest-v0", *scene, "--episode-length", 20, "--episodes", 1)
+    shown = output(capsys, "evaluate", VFH, *words, "--env.speed", 3)
+    assert "steady     success 0.0000\n" in shown
+    assert "touched    0\n" in shown
+    assert "flight time 1 s\n" in shown
+    for name in ("mean speed ", "top speed ", "least clearance ", "scene      traversability "):
+        assert f"\n{name}" in shown

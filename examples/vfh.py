@@ -1,6 +1,8 @@
 """The vector field histogram VFH+: a pilot that steers around what a level lidar sees.
 
 I. Ulrich and J. Borenstein, "VFH+: Reliable Obstacle Avoidance for Fast Mobile Robots", ICRA 1998.
+
+    rotorgram evaluate examples/vfh.py:Vfh --env rotorgram/Forest-v0
 """
 
 import math
@@ -8,11 +10,10 @@ from collections.abc import Mapping
 from typing import ClassVar, NamedTuple
 
 import numpy as np
-
-from ..envs.spec import EnvSpec, component_names
-from ..models.errors import InputError
-from .layers import Floats
-from .policies import Array, Observation
+from rotorgram.agents.policies import Array, Observation
+from rotorgram.envs import EnvSpec
+from rotorgram.envs.spec import component_names
+from rotorgram.models import InputError
 
 SECTORS = 72
 """Of the polar histogram: α = 5°."""
@@ -68,8 +69,8 @@ class Vfh:
     batch. Raises `InputError` for an env that lacks what it needs.
     """
 
-    label = "VFH+"
-    options: ClassVar[dict[str, object]] = {
+    label: ClassVar[str] = "VFH+"
+    options: ClassVar[Mapping[str, object]] = {
         "action": "velocity",
         "sensors": {"lidar": {"model": "rplidar_a1"}},
     }
@@ -103,13 +104,13 @@ class Vfh:
         self._blocked: Array | None = None
         self._last: Array | None = None
 
-    def act(self, observation: Observation) -> Floats:
+    def act(self, observation: Observation) -> Array:
         """Velocity and yaw rate as the env's action, float32, shape (4,)."""
         assert isinstance(observation, Mapping)
-        action: Floats = self.actions({name: x[None] for name, x in observation.items()})[0]
+        action: Array = self.actions({name: x[None] for name, x in observation.items()})[0]
         return action
 
-    def actions(self, observations: Mapping[str, Array]) -> Floats:
+    def actions(self, observations: Mapping[str, Array]) -> Array:
         """The same of N drones at once: float32, shape (N, 4)."""
         numbers = observations["observation"].astype(float)[:, self._at].T
         wanted_x, wanted_y, climb, *flown, ax, ay, az, height = numbers
@@ -126,7 +127,7 @@ class Vfh:
         actions = np.column_stack(
             (asked * np.cos(angle), asked * np.sin(angle), asked_climb, 0.0 * asked)
         )
-        clipped: Floats = np.clip(actions / self._scale, -1.0, 1.0).astype(np.float32)
+        clipped: Array = np.clip(actions / self._scale, -1.0, 1.0).astype(np.float32)
         return clipped
 
     def _choose(self, obstacles: Array, target: Array, flown: Array) -> Choice:

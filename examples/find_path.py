@@ -1,14 +1,19 @@
-"""A way through a scene, by A* (Hart, Nilsson and Raphael 1968) on a grid."""
+"""A way through a scene, by A* (Hart, Nilsson and Raphael 1968) on a grid.
 
+    python examples/find_path.py maze:3,clear=ends
+
+From x = -22 m to x = 22 m, 2 m above the ground, for a craft with a radius of 0.5 m.
+"""
+
+import argparse
 import heapq
 import math
 from itertools import product
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-
-from ..models.errors import InputError, shortened
-from .solids import Solids, numbers
+from rotorgram.models import InputError
+from rotorgram.scenes import Solids
 
 Array = NDArray[np.float64]
 _Cell = tuple[int, ...]
@@ -31,13 +36,10 @@ def find_path(
     none. Raises `InputError`.
     """
     room = solids.field(low, high, cell) - radius
-    corner = numbers("low", low)
-    places = (numbers("ends", ends) - corner) / cell
+    corner = np.asarray(low, float)
+    places = (np.asarray(ends, float) - corner) / cell
     if places.shape != (2, 3) or not ((places >= 0) & (places < room.shape)).all():
-        got = shortened(ends)
-        raise InputError(
-            f"ends: expected two places within the grid from {shortened(low)}, got {got}"
-        )
+        raise InputError(f"ends: expected two places within the grid from {low}, got {ends}")
     first, last = map(tuple, places.astype(int).tolist())
     free = set(map(tuple, np.argwhere(room >= 0).tolist()))
     found = _search(free, first, last) if {first, last} <= free else []
@@ -65,3 +67,17 @@ def _search(free: set[_Cell], first: _Cell, last: _Cell) -> list[_Cell]:
                 before[there] = here
                 heapq.heappush(waiting, (total + math.dist(there, last), there))
     return []
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description="Find a way through a scene.")
+    parser.add_argument("scene", nargs="?", default="maze:3,clear=ends")
+    solids = Solids.of_scene(parser.parse_args().scene).standing()
+    ends = [(-22.0, 0.0, 2.0), (22.0, 0.0, 2.0)]
+    way = find_path(solids, ends, (-25, -25, 1.75), (25, 25, 2.25), radius=0.5)
+    length = np.linalg.norm(np.diff(way, axis=0), axis=1).sum()
+    print(f"{len(way)} points, {length:.1f} m")
+
+
+if __name__ == "__main__":
+    main()
