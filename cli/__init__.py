@@ -15,7 +15,6 @@ import re
 import signal
 import sys
 from collections.abc import Sequence
-from contextlib import AbstractContextManager, nullcontext
 from errno import ENOSPC, EPIPE
 from importlib import import_module
 from pathlib import Path
@@ -109,23 +108,11 @@ def _run(words: list[str]) -> int:
 
     if get_terminal_size().columns < 40:  # tyro does not end on narrower terminals
         os.environ["COLUMNS"] = "40"
-    early = _simulator(name, words)
     # Importing OpenGL takes time, also for a command that draws nothing.
-    with hidden_gl_setting(), early:
+    with hidden_gl_setting():
         module = import_module(f".{name.replace('-', '_')}", __name__)
         kind: type[Command] = getattr(module, _class_of(name))
         return parse(kind, f"rotorgram {name}", words[1:]).run() or 0
-
-
-def _simulator(name: str, words: list[str]) -> AbstractContextManager[None]:
-    """The process of a simulator that a command will need: both import at the same time."""
-    if name != "train" or "--udp" not in words:
-        return nullcontext()
-    if not {"--listen", "--no-udp", "--help", "-h"}.isdisjoint(words):
-        return nullcontext()
-    from ..udp.process import begun_early
-
-    return begun_early()
 
 
 def _class_of(name: str) -> str:

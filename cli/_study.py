@@ -8,16 +8,17 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
 
+from ..agents import is_controller
+from ..envs.config import EnvConfig
 from ..flights.executors import RunsFailed, WorkersConfig
 from ..flights.folders import FolderBusy
 from ..models.errors import InputError, NoOpenGL, require
+from ..training.settings import Row, Study
 from ._flags import Options, Words
 from ._training import TrainingFlags, folder_to_write
 
 if TYPE_CHECKING:
-    from ..envs.config import EnvConfig
     from ..training.results import Results
-    from ..training.settings import Row, Study
 
 _RESUMED = ("jobs", "runner", "address", "film")
 """Flags that a resumed command may be given: they change no number."""
@@ -47,7 +48,7 @@ class StudyFlags(TrainingFlags, WorkersConfig):
         """The command without flags."""
         return type(self).__name__.lower()
 
-    def study(self) -> "Study":
+    def study(self) -> Study:
         """The study that the flags describe. Raises `InputError`."""
         raise NotImplementedError
 
@@ -62,7 +63,7 @@ class StudyFlags(TrainingFlags, WorkersConfig):
         with folder_to_write(self.out, self.words.replace(" ", "-")) as folder:
             self._fly(study, folder, workers)
 
-    def _fly(self, study: "Study", folder: Path, workers: WorkersConfig) -> None:
+    def _fly(self, study: Study, folder: Path, workers: WorkersConfig) -> None:
         from ..training.study import run_study
         from ._progress import bars
 
@@ -78,7 +79,7 @@ class StudyFlags(TrainingFlags, WorkersConfig):
             raise
         report(folder, self.film)
 
-    def _resumed(self, folder: Path) -> "Study":
+    def _resumed(self, folder: Path) -> Study:
         from ..training.results import Results
 
         results = Results.read(folder)
@@ -111,10 +112,8 @@ class StudyFlags(TrainingFlags, WorkersConfig):
     def _given(self, names: Words) -> Options:
         return {name: getattr(self, name) for name in names if name in self.given}
 
-    def new_row(self, agent: str, name: str, changes: Options, env: "EnvConfig") -> "Row":
+    def new_row(self, agent: str, name: str, changes: Options, env: EnvConfig) -> Row:
         """A row of an agent, with the settings that were given."""
-        from ..agents import is_controller
-        from ..training.settings import Row
 
         if is_controller(agent):
             return Row(agent=agent, name=name, env=env)
@@ -122,9 +121,8 @@ class StudyFlags(TrainingFlags, WorkersConfig):
         settings |= self.given_of_rows()
         return Row(agent=agent, name=name, env=env, set=changes, **settings)
 
-    def changed(self, row: "Row") -> "Row":
+    def changed(self, row: Row) -> Row:
         """A row of a file with what the flags change: of all rows."""
-        from ..envs.config import EnvConfig
 
         changes = {**row.set, **self.changes()}
         env = row.env

@@ -2,15 +2,13 @@
 
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 from tyro.conf import Positional, arg
 
+from ..training.settings import BOARD, Study
 from ._flags import BackendOfPreset
 from ._study import StudyFlags
-
-if TYPE_CHECKING:
-    from ..training.settings import Study
 
 
 class Benchmark(StudyFlags):
@@ -26,10 +24,8 @@ class Benchmark(StudyFlags):
     backend: BackendOfPreset = "mujoco"
     """What steps the drones in training: mujoco, or rigid (without contact, fast)."""
 
-    def study(self) -> "Study":
+    def study(self) -> Study:
         """The rows of the file, by default on seeds that no other command uses."""
-        from ..training.settings import BOARD, Study
-
         study = Study.from_toml(
             self.rows or BOARD, {"seeds": 10, "first_seed": 5000, "snapshots": 20}
         )

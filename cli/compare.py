@@ -3,16 +3,16 @@
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 from tyro.conf import Positional, arg
 
+from ..agents import CONTROLLERS
+from ..envs.registry import env_spec
 from ..models import InputError
+from ..training.settings import Kind, Row, Study, short_name
 from ._flags import DEFAULT_ENV
 from ._study import StudyFlags
-
-if TYPE_CHECKING:
-    from ..training.settings import Study
 
 _OF_FILES = ("seeds", "first_seed", "snapshots", "curve_episodes", "episodes", "evaluation",
                     "wire", "keep_steps")  # fmt: skip
@@ -38,13 +38,11 @@ class Compare(StudyFlags):
     """Whether each of them trains over UDP, with a simulator process of its own. The numbers are
     the same without, but for the times."""
 
-    def study(self) -> "Study":
+    def study(self) -> Study:
         """The study of the files, or of the agents."""
         return self._of_files() if self.files else self._of_agents()
 
-    def _of_files(self) -> "Study":
-        from ..training.settings import Study
-
+    def _of_files(self) -> Study:
         studies = [Study.from_toml(path) for path in self.files]
         rows = [self.changed(row) for study in studies for row in study.rows]
         settings = self.given_of_study()
@@ -58,11 +56,7 @@ class Compare(StudyFlags):
                 )
         return replace(studies[0], rows=tuple(rows), kind="compare", **settings)
 
-    def _of_agents(self) -> "Study":
-        from ..agents import CONTROLLERS
-        from ..envs.registry import env_spec
-        from ..training.settings import Kind, Row, Study, short_name
-
+    def _of_agents(self) -> Study:
         env = self.env_config()
         changes = self.changes()
         if not self.agents:

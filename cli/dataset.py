@@ -5,7 +5,7 @@ from typing import Literal
 
 from tyro.conf import Positional
 
-from ._flags import Command
+from ._flags import Command, Files
 
 
 class Dataset(Command):
@@ -14,7 +14,7 @@ class Dataset(Command):
     An episode that was given up, or whose end is not in the journal, is left out and counted.
     """
 
-    journals: Positional[tuple[Path, ...]]
+    journals: Positional[Files]
     """MCAP files that --record wrote, all of one env."""
     to: Literal["minari", "parquet"]
     """minari: a data set that minari.load_dataset finds. parquet: one file, one row per step."""

@@ -3,17 +3,14 @@
 import json
 from collections.abc import Iterable, Mapping
 from itertools import chain, product
-from typing import TYPE_CHECKING
 
 from tyro.conf import Positional
 
 from ..agents.registry import AlgorithmName
 from ..models import InputError
+from ..training.settings import Row, Study
 from ._flags import NamedValues, Options, parse_value
 from ._study import StudyFlags
-
-if TYPE_CHECKING:
-    from ..training.settings import Row, Study
 
 Values = tuple[object, ...]
 
@@ -36,10 +33,8 @@ class Sweep(StudyFlags):
     def words(self) -> str:
         return f"sweep {self.algorithm}"
 
-    def study(self) -> "Study":
+    def study(self) -> Study:
         """A row for each point, on seeds that no comparison uses by default."""
-        from ..training.settings import Study
-
         grid = parse_grid(chain.from_iterable(self.grid))
         if not grid:
             raise InputError("grid: expected a hyperparameter (--grid gamma=0.99,0.999), got none")
@@ -50,7 +45,7 @@ class Sweep(StudyFlags):
         settings |= self.given_of_study()
         return Study(rows=tuple(rows), kind="sweep", evaluation="tuning", **settings)
 
-    def _row(self, point: Mapping[str, object]) -> "Row":
+    def _row(self, point: Mapping[str, object]) -> Row:
         changes = self.changes()
         options: Options = {}
         for name, value in point.items():

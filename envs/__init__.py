@@ -17,6 +17,7 @@ from .. import import_when_used
 from ..models.fields import Limits
 from .registry import register
 from .spec import ArraySpec, Discrete, EnvSpec, Mark, Metric
+from .tasks import __all__ as _tasks
 
 if TYPE_CHECKING:
     from .config import EnvConfig
@@ -32,8 +33,5 @@ __all__ = [
 
 __getattr__ = import_when_used(__name__)
 
-for _name in (
-    "Elevation", "Hover", "Waypoints", "Tracking", "Racing", "Landing", "Recovery", "PayloadHover",
-    "Formation", "Crossing", "Escort", "Cable", "Forest", "Dodge", "Warehouse", "Gates",
-):  # fmt: skip
+for _name in _tasks:
     register(f"rotorgram/{_name}-v0", f"rotorgram.envs.tasks:{_name}")

@@ -34,15 +34,6 @@ def make_loop(config: EnvConfig, num_worlds: int = 1) -> Loop:
     return Loop(config, num_worlds)
 
 
-def import_ahead() -> None:
-    """Import what most loops need, before it is known what flies."""
-    from ..sim.backends import rigid  # noqa: F401
-    from ..sim.compile.llvm import trouble
-    from . import machine  # noqa: F401
-
-    trouble()
-
-
 class CompiledLoop(Loop):
     """A loop that a machine steps, with the same bits; what cannot be compiled NumPy runs.
 
@@ -55,19 +46,21 @@ class CompiledLoop(Loop):
     """Why it is not compiled, once that was tried."""
 
     def _step(self, seeds: Seeds | None, *, flies: bool) -> None:
-        machine = self.machine()
+        record = self._record
+        begun = record.begun
+        if begun is not None and not record.has_begun and not begun.all():
+            self._settle()
+            machine = None  # NumPy begins all, so that every array exists
+        else:
+            machine = self.machine()
         if machine is None:
             super()._step(seeds, flies=flies)
             return
-        record = self._record
-        begun = record.begun
         sent = record.sent if flies else None
         flew = record.flown
         if seeds is not None:
             seeds = seeds[:: len(self.spec.agents)]
         try:
-            if begun is not None and not record.has_begun and not begun.all():
-                machine.begin_all()
             if flies and self._world.scenery.moves:
                 steps = machine.memory.get("record/kept/steps")
                 self._move_solids(steps + (1 if flew is None else flew))

@@ -233,11 +233,6 @@ class EnvConfig:
         same = str(other.scene) == str(self.scene)
         return replace(other, scene=self.scene) if same else other
 
-    @classmethod
-    def from_toml(cls, path: Path | str, **keywords: Any) -> "EnvConfig":
-        """A config from a TOML file of keywords; keyword arguments win. See `read_keywords`."""
-        return cls.from_keywords(**read_keywords(path) | keywords)
-
     def to_dict(self) -> Values:
         """All fields as JSON values, with the version."""
         content = {one.name: getattr(self, one.name) for one in fields(self)}
@@ -337,7 +332,7 @@ class EnvConfig:
                 raise InputError(f"{name}: expected none with several vehicles, got {used}")
         randomize = Randomization(self.randomize, None)
         settings = self.backend.settings
-        check_world(vehicle, self.backend.name, self.drones, self.effects, randomize, settings)
+        check_world(vehicle, self.backend.name, self.effects, randomize, settings)
         resolved = replace(
             whole, vehicle_hash=vehicle.hash, task_hash=source_hash(task, self.scene.type.draw)
         )

@@ -15,7 +15,6 @@ import numpy as np
 from ..models.errors import InputError
 from ..sim import World
 from ..sim.compile import Program, Untraceable, lift, read
-from ..sim.compile.alike import with_calls
 from ..sim.compile.layout import Layout, Memory, fields_of
 from ..sim.compile.llvm import Region, compiled, widest
 from ..sim.snapshots import Arrays, Snapshot, joined, part_of
@@ -28,7 +27,7 @@ from .stages.record import Mask, Record
 from .telemetry import telemetry_of
 
 LANES = 64  # Worlds of a block: their numbers fit into the nearest cache
-MOST = 30_000  # Operations of a step but those of functions: more take too long to compile
+MOST = 60_000  # Operations of a step but those of functions: more take too long to compile
 _FIRST, _CONTROL, _PUSH, _BEGIN, _LAST = "first", "control", "push", "begin", "last"
 """Code before the physics of a step, between two of its calls, for episodes that begin, and after.
 A step whose physics is array code is the last alone."""
@@ -250,14 +249,6 @@ class Machine:
             raise InputError(f"derivative: expected bare ground, no rays, no pictures, got {got}")
         return Derivative(self._loop, self._layouts[0], self._width, self._worlds)
 
-    def begin_all(self) -> None:
-        """As `Record.begin_all`."""
-        memory = self.memory
-        everybody = np.ones_like(memory.get("record/kept/waiting"))
-        self.step(None, ~everybody, everybody, everybody)
-        memory.put("record/kept/waiting", everybody)
-        memory.put("record/kept/episodes", 0 * memory.get("record/kept/episodes"))
-
     def _seed(self, begun: Mask, seeds: Seeds | None) -> None:
         """As `Random.seed`, where there are seeds; and draw the layouts, which code does not."""
         world = self._world
@@ -363,14 +354,7 @@ class Machine:
         record.begun = before["begun"]
         record.sent = before["sent"]
         record.run(before.get(mask), stages)
-        stores = _stores(program, self._loop.state(), before)
-        drones = self._world.shape[1]
-        if drones > 1:
-            fields = {**self._layouts[0].fields, **self._outside}
-            for of_world in (*_MASKS, _KEYS):
-                del fields[of_world]
-            program, stores = with_calls(mask, program, stores, fields, drones)
-        return Region(mask, program, stores)
+        return Region(mask, program, _stores(program, self._loop.state(), before))
 
     def _looked(self) -> Region:
         """What leaves the loop, and what is told of it."""

@@ -1,8 +1,8 @@
-"""Find a landing pad in a picture: train a small network on what `rotorgram capture` wrote.
+"""Find a landing pad in a picture: train a small network on what `capture.py` wrote.
 
     rotorgram evaluate geometric --env rotorgram/Landing-v0 --vehicle crazyflie2 \\
         --episodes 100 --record runs/pad.mcap
-    rotorgram capture runs/pad.mcap --vehicle crazyflie2 --scene airport \\
+    python examples/capture.py runs/pad.mcap --vehicle crazyflie2 --scene airport \\
         --cameras down down_segmentation --every 5 --aside 1 --tilt 0.4 --fast --out runs/pad
     python examples/pad_detector.py runs/pad [--epochs 20] [--seeds 1] [--out FILE.json]
 

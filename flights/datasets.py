@@ -50,15 +50,13 @@ class RecordedEpisodes:
 
     Raises:
         OSError: A file cannot be read.
-        InputError: There is no journal, or no whole episode in them; while iterating: a file is no
-            journal, two have different specs, or the same session.
+        InputError: There is no whole episode in them; while iterating: a file is no journal, two
+            have different specs, or the same session.
     """
 
     spec: EnvSpec
 
     def __init__(self, paths: Sequence[Path]) -> None:
-        if not paths:
-            raise InputError("journals: expected at least one file, got none")
         self.left_out = 0
         self.count = 0
         self.steps = 0

@@ -161,20 +161,16 @@ def _times(tracks: Sequence[FilmTrack], config: Film, *, still: bool) -> list[tu
 
 
 def grid(count: int, width: int, height: int) -> tuple[int, int]:
-    """Columns and rows of so many panes in a picture of so many pixels, with few empty places."""
-
-    def badness(shape: tuple[int, int]) -> float:
-        columns, rows = shape
-        aspect = (width * rows) / (height * columns)
-        return abs(math.log(aspect / _ASPECT)) + (columns * rows - count) / count
-
-    return min(((columns, -(-count // columns)) for columns in range(1, count + 1)), key=badness)
+    """Columns and rows of so many panes in a picture of so many pixels."""
+    rows = round(math.sqrt(count * height * _ASPECT / width))
+    rows = min(max(rows, 1), count)
+    return math.ceil(count / rows), rows
 
 
 def _frames(
     tracks: Sequence[FilmTrack], config: Film, times: Sequence[tuple[int, float]], tell: Tell
 ) -> Generator[Picture, None, None]:
-    """Frames, shape (height, width, 3). One canvas of a pane's size serves every pane."""
+    """Frames, shape (height, width, 3)."""
     columns, rows = grid(len(tracks), config.width, config.height)
     width = (config.width - _SPACE * (columns - 1)) // columns
     height = (config.height - _SPACE * (rows - 1)) // rows
@@ -186,10 +182,12 @@ def _frames(
             scene = _scene_of(tracks, config, episode)
             if scene != shown:
                 opened.close()
-                stage = Stage(scene, drones, vehicle=config.vehicle)
-                canvas = opened.enter_context(Canvas(stage, width, height, fast=config.fast))
-                panes = [_Pane(track, stage.twin(), canvas, config, named) for track in tracks]
                 shown = scene
+                panes = []
+                for track in tracks:
+                    stage = Stage(scene, drones, vehicle=config.vehicle)
+                    canvas = opened.enter_context(Canvas(stage, width, height, fast=config.fast))
+                    panes.append(_Pane(track, canvas, config, named))
             frame = np.full((config.height, config.width, 3), _DARK, np.uint8)
             for place, pane in enumerate(panes):
                 row, column = divmod(place, columns)
@@ -212,7 +210,6 @@ class _Pane:
     """Pictures of one track, drawn where they change."""
 
     track: FilmTrack
-    stage: Stage
     canvas: Canvas
     config: Film
     named: bool
@@ -228,12 +225,13 @@ class _Pane:
         if self.picture is not None and self.shown == (episode, step):
             return self.picture
         flown = self.track.moments[episode]
+        stage = self.canvas.stage
         first = self.shown[1] + 1 if episode == self.shown[0] else 0
         for now in range(first, step + 1):  # paths have no gaps
-            self.stage.show(*(own[min(now, len(own) - 1)] for own in flown))
+            stage.show(*(own[min(now, len(own) - 1)] for own in flown))
         self.shown = episode, step
-        self.picture = self.canvas.draw(self.config.camera, self.stage, self._lines(episode, step))
-        add_insets(self.picture, self.stage.moments[0])
+        self.picture = self.canvas.draw(self.config.camera, self._lines(episode, step))
+        add_insets(self.picture, stage.moments[0])
         return self.picture
 
     def _lines(self, episode: int, step: int) -> Lines:
@@ -243,13 +241,14 @@ class _Pane:
             return [(track.name, "")] if self.named else []
         seconds = step * track.trajectories[0].spec.control_period
         lines = [(track.name, f"{seconds:.2f} s")]
-        distance = self.stage.least_distance
+        stage = self.canvas.stage
+        distance = stage.least_distance
         if distance is not None:
             lines.append(("least distance", f"{distance:.2f} m"))
         else:
-            for metric in self.stage.moments[0].metrics[:1]:
+            for metric in stage.moments[0].metrics[:1]:
                 lines.append((metric.label, metric.text))
-        for reading in self.stage.moments[0].readings:
+        for reading in stage.moments[0].readings:
             lines.append((reading.name, f"0 to {reading.reach:g} m"))
         note = track.note(episode, step)
         return [*lines, (note, "")] if note else lines

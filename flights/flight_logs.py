@@ -29,6 +29,7 @@ THROTTLE = "m{}_throttle"
 is the share of the largest thrust. A log has at least one of the three; the first of them
 counts."""
 _KINDS = (SPEED, SPEED_COMMAND, THROTTLE)
+_ATTITUDES = slice(4, 8)  # of the columns t and `MOTION`
 _LONGEST_GAP = 0.1  # s: longer gaps are not interpolated
 _POSITION_ERROR = 0.5  # m: between two samples, besides the distance by the velocity
 _ATTITUDE_ERROR = 0.5  # rad: the same for the attitude
@@ -71,19 +72,19 @@ def read_log(path: Path | str, vehicle: Vehicle, period: float = 0.01) -> Flight
 
 def _flight(name: str, table: Columns, vehicle: Vehicle, period: float) -> FlightLog:
     kind, samples = _samples(table, vehicle.num_rotors)
-    times, states, speeds = np.split(samples, (1, 1 + len(MOTION)), axis=1)
-    times = times[:, 0]
-    states[:, 3:7] = _without_flips(states[:, 3:7])
+    if not np.isfinite(samples).all():
+        _refuse("finite numbers", "others")
+    first = 1 + len(MOTION)  # column of the rotors
+    samples[:, _ATTITUDES] = _without_flips(samples[:, _ATTITUDES])
     if kind == THROTTLE:
-        speeds = _commanded_speeds(speeds, vehicle)
-    _check_speeds(vehicle, speeds)
-    samples = np.concatenate((states, speeds), axis=1)
-    later = _later_rows(times)
-    rows = _consistent_rows(times, samples, later)
-    times = times[rows]
-    grid = _grid(times, period)
-    uniform = np.stack([np.interp(grid, times, column) for column in samples[rows].T], axis=1)
-    states, speeds = np.split(uniform, [len(MOTION)], axis=1)
+        samples[:, first:] = _commanded_speeds(samples[:, first:], vehicle)
+    _check_speeds(vehicle, samples[:, first:])
+    latest = np.maximum.accumulate(samples[:, 0])
+    samples = samples[np.diff(latest, prepend=-np.inf) > 0]
+    consistent = _consistent(samples)
+    grid = _grid(consistent[:, 0], period)
+    columns = [np.interp(grid, consistent[:, 0], column) for column in consistent.T]
+    _, states, speeds = np.split(np.stack(columns, axis=1), (1, first), axis=1)
     length = np.linalg.norm(states[:, 3:7], axis=1, keepdims=True)
     if not (length > 0.5).all():
         _refuse("quaternions of length 1", f"{length.min():.3g}")
@@ -94,7 +95,7 @@ def _flight(name: str, table: Columns, vehicle: Vehicle, period: float) -> Fligh
         states=states,
         speeds=speeds,
         measured=kind == SPEED,
-        left_out=len(later) - len(rows),
+        left_out=len(samples) - len(consistent),
     )
 
 
@@ -120,21 +121,21 @@ def _refuse(expected: str, got: str) -> NoReturn:
 
 
 def _samples(table: Columns, rotors: int) -> tuple[str, Floats]:
-    """The kind of the rotors' columns, and the columns of t, of `MOTION` and of the rotors."""
-    kinds = {kind: [kind.format(number) for number in range(1, rotors + 1)] for kind in _KINDS}
-    complete = [kind for kind, names in kinds.items() if all(name in table for name in names)]
+    """The kind of the rotors' columns; t, `MOTION` and these columns, shape (N, 14 + R)."""
+    numbers = range(1, rotors + 1)
+    given = [kind for kind in _KINDS if table.keys() >= {kind.format(i) for i in numbers}]
+    if not given:
+        names = " or ".join(kind.format(f"1...{rotors}") for kind in _KINDS)
+        _refuse(f"columns {names}", "none")
     columns = []
-    for name in ("t", *MOTION, *(kinds[complete[0]] if complete else ())):
+    for name in ("t", *MOTION, *(given[0].format(i) for i in numbers)):
         if name not in table:
             _refuse(f"a column {name}", ", ".join(table))
         try:
             columns.append(np.array(table[name], np.float64))
         except (TypeError, ValueError):
             _refuse(f"numbers in {name}", "others")
-    if not complete:
-        names = " or ".join(kind.format(f"1...{rotors}") for kind in _KINDS)
-        _refuse(f"columns {names}", "none")
-    return complete[0], np.stack(columns, axis=1)
+    return given[0], np.stack(columns, axis=1)
 
 
 def _table(path: Path) -> Columns:
@@ -188,57 +189,41 @@ def _without_flips(quaternions: Floats) -> Floats:
 # ---- samples
 
 
-def _later_rows(times: Floats) -> Ints:
-    """Samples with a later time than all before."""
-    if not np.isfinite(times).all():
-        _refuse("finite times", "others")
-    latest = np.maximum.accumulate(times)
-    return np.flatnonzero(np.diff(latest, prepend=-np.inf) > 0)
-
-
-def _consistent_rows(times: Floats, samples: Floats, rows: Ints) -> Ints:
-    """The rows without single impossible samples."""
-    if not np.isfinite(samples[rows]).all():
-        _refuse("finite numbers", "others")
-    most = max(1, int(_MOST_LEFT_OUT * len(rows)))
-    least = len(rows) - most
+def _consistent(samples: Floats) -> Floats:
+    """The samples without single ones that contradict the samples before and after."""
+    if len(samples) < 2:
+        _refuse("two or more samples", str(len(samples)))
     rule = "positions and attitudes that agree with velocities and rates"
-    while len(bad := np.flatnonzero(~_agree(times, samples, rows))):
-        step = int(bad[0])
-        for sample in (step + 1, step):
-            rest = np.delete(rows, sample)
-            around = rest[max(sample - 1, 0) : sample + 1]
-            if _agree(times, samples, around).all():
-                break
-        else:
-            _refuse(rule, f"a jump at {times[rows[step + 1]]:.6g} s")
-        rows = rest
-        if len(rows) < least:
-            _refuse(rule, f"more than {most} samples that do not")
-    return rows
+    bad = ~_agree(samples)
+    alone = np.append(bad, True) & np.insert(bad, 0, True)
+    most = max(1, int(_MOST_LEFT_OUT * len(samples)))
+    if alone.sum() > most:
+        _refuse(rule, f"more than {most} samples that do not")
+    consistent = samples[~alone]
+    jumps = consistent[1:][~_agree(consistent)]
+    if len(jumps):
+        _refuse(rule, f"a jump at {jumps[0, 0]:.6g} s")
+    return consistent
 
 
-def _agree(times: Floats, states: Floats, rows: Ints) -> NDArray[np.bool_]:
-    """Whether each sample follows from the one before by the mean rates of both."""
-    first = states[rows[:-1]]
-    second = states[rows[1:]]
-    seconds = np.diff(times[rows])[:, None]
+def _agree(samples: Floats) -> NDArray[np.bool_]:
+    """Whether each sample but the first follows from the one before by the mean rates of both."""
+    attitudes = samples[:, _ATTITUDES]
     with np.errstate(all="ignore"):
-        change = 0.5 * (first[:, 7:13] + second[:, 7:13]) * seconds
-        distance = np.linalg.norm(second[:, :3] - first[:, :3] - change[:, :3], axis=1)
-        turned = np.linalg.norm(change[:, 3:], axis=1)
-        cosine = np.abs((first[:, 3:7] * second[:, 3:7]).sum(axis=1))
+        mean = 0.5 * (samples[1:] + samples[:-1])
+        step = np.diff(samples, axis=0)
+        distance = np.linalg.norm(step[:, 1:4] - mean[:, 8:11] * step[:, :1], axis=1)
+        turned = np.linalg.norm(mean[:, 11:14], axis=1) * step[:, 0]
+        cosine = np.abs((attitudes[1:] * attitudes[:-1]).sum(axis=1))
         angle = 2 * np.arccos(np.clip(cosine, 0.0, 1.0))
-        near = distance <= _POSITION_ERROR
-        level = np.abs(angle - turned) <= _ATTITUDE_ERROR
-    agree: NDArray[np.bool_] = near & level
+        is_near = distance <= _POSITION_ERROR
+        is_turned = np.abs(angle - turned) <= _ATTITUDE_ERROR
+    agree: NDArray[np.bool_] = is_near & is_turned
     return agree
 
 
 def _grid(times: Floats, period: float) -> Floats:
     """Uniform times from the first sample on. Raises `InputError` for a gap."""
-    if len(times) < 2:
-        _refuse("two or more samples", str(len(times)))
     gap = float(np.diff(times).max())
     if gap > _LONGEST_GAP:
         _refuse(f"no gap of more than {_LONGEST_GAP:g} s", f"{gap:.3g} s")

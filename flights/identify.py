@@ -265,17 +265,16 @@ class Fit:
 
     def _errors(self, candidates: Sequence[Numbers], start: Floats | None = None) -> Floats:
         """Differences, (P, M, H, 4, 3), of P candidates; of those with starts (P, M, 13) too."""
-        windows = self.windows.repeated(len(candidates))
+        windows = self.windows
         if start is not None:
-            windows = replace(windows, start=start.reshape(-1, 13))
+            windows = replace(windows, start=start)
         if self.logs and not self.logs[0].measured:
             steps = windows.speeds.shape[1]
-            speeds = [_cut(self.logs, one, steps).speeds for one in candidates]
-            windows = replace(windows, speeds=np.concatenate(speeds))
+            speeds = np.stack([_cut(self.logs, one, steps).speeds for one in candidates])
+            windows = replace(windows, speeds=speeds)
         with np.errstate(all="ignore"):
             errors = differences(predict(self.vehicle, candidates, windows), windows.truth)
-        errors = np.clip(np.nan_to_num(errors, nan=1e6), -1e6, 1e6)
-        return errors.reshape(len(candidates), -1, *errors.shape[1:])
+        return np.clip(np.nan_to_num(errors, nan=1e6), -1e6, 1e6)
 
     def _weighed(self, candidates: Sequence[Numbers], start: Floats | None = None) -> Floats:
         """Errors in spreads, (P, M, 12 H)."""
@@ -310,25 +309,21 @@ class Fit:
 
 def _shifted(start: Floats, sizes: Floats) -> Floats:
     """Start states (M, 13), and the same with each of 12 errors: shape (13, M, 13)."""
-    shifted = np.tile(start, (13, 1, 1))
-    shifted[1:4, :, :3] += np.diag(sizes[:3])[:, None]
-    for state, turn in zip(shifted[4:7], np.diag(sizes[3:6]), strict=True):
-        state[:, 3:7] = advanced(start[:, 3:7], turn)
-    shifted[7:, :, 7:] += np.diag(sizes[6:])[:, None]
-    return shifted
+    errors = np.zeros((13, 1, 12))
+    errors[1:, 0] = np.diag(sizes)
+    position = start[:, :3] + errors[..., :3]
+    quaternion = advanced(start[:, 3:7], errors[..., 3:6])
+    rest = start[:, 7:] + errors[..., 6:]
+    return np.concatenate((position, quaternion, rest), axis=-1)
 
 
 def _flattened(vehicle: Vehicle, numbers: Numbers) -> dict[str, float]:
     """With the largest moment of inertia at most the sum of the others, as of every body."""
-    inertia = inertia_of(vehicle, numbers)
-    (low, middle, high), axes = np.linalg.eigh(inertia)
-    corrected = dict(numbers)
-    if high > low + middle:
-        moments = np.array((low, middle, (low + middle) * (1 - 1e-9)))
-        inertia = (axes * moments) @ axes.T
-        for i, axis in enumerate("xyz"):
-            corrected[f"body.inertia.{axis}"] = float(inertia[i, i])
-    return corrected
+    moments, axes = np.linalg.eigh(inertia_of(vehicle, numbers))
+    moments[2] = min(moments[2], (moments[0] + moments[1]) * (1 - 1e-9))
+    inertia = (axes * moments) @ axes.T
+    names = [f"body.inertia.{axis}" for axis in "xyz"]
+    return {**numbers, **dict(zip(names, np.diag(inertia).tolist(), strict=True))}
 
 
 def _scale(vehicle: Vehicle, numbers: Numbers, name: str) -> float:

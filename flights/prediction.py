@@ -11,7 +11,7 @@ import copy
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
-from typing import Any, Self
+from typing import Self
 
 import numpy as np
 
@@ -78,7 +78,10 @@ def inertia_of(vehicle: Vehicle, numbers: Numbers) -> Floats:
 
 @immutable
 class Windows:
-    """M starts of flights, the rotor speeds from there on, and the measured motion."""
+    """M starts of flights, the rotor speeds from there on, and the measured motion.
+
+    Starts and speeds may have a first axis more, of the P candidates that begin there.
+    """
 
     period: float
     """Of the samples, s."""
@@ -94,15 +97,6 @@ class Windows:
     """Index of the flight of each start, shape (M,)."""
     index: Ints
     """Sample of the flight at which it starts, shape (M,)."""
-
-    def repeated(self, times: int) -> Self:
-        """The same windows several times, one lot after the other."""
-        arrays: dict[str, Any] = {
-            name: np.concatenate([values] * times)
-            for name, values in vars(self).items()
-            if isinstance(values, np.ndarray)
-        }
-        return replace(self, **arrays)
 
     @classmethod
     def cut(
@@ -141,13 +135,17 @@ def mean_speeds(speeds: Floats, step: int) -> Floats:
 
 
 def predict(vehicle: Vehicle, candidates: Sequence[Numbers], windows: Windows) -> Floats:
-    """States at the horizons, (M, H, 13), of the vehicle with other numbers.
+    """States at the horizons, (P, M, H, 13), of the vehicle with each of P candidates' numbers.
 
-    Each candidate flies its share of the windows, the first one the first share; all at once, much
-    faster than one after the other. A physics step is the period of the samples.
+    All fly at once, much faster than one after the other. A physics step is the period of the
+    samples.
     """
-    starts = len(windows.start)
-    share = starts // len(candidates)
+    count = len(candidates)
+    share, steps, rotors = windows.speeds.shape[-3:]
+    starts = count * share
+    speeds = np.broadcast_to(windows.speeds, (count, share, steps, rotors))
+    speeds = speeds.reshape(starts, steps, rotors)
+    start = np.broadcast_to(windows.start, (count, share, 13)).reshape(starts, 1, 13)
     numbers = {name: np.repeat([one[name] for one in candidates], share) for name in NAMES}
     each = {name: values[:, None] for name, values in numbers.items()}
     world = _world(vehicle, numbers, windows.period)
@@ -158,23 +156,23 @@ def predict(vehicle: Vehicle, candidates: Sequence[Numbers], windows: Windows) -
         reaction=each["rotors.reaction"] / own,
         air=each,
     )
-    position, quaternion, velocity, rates = np.split(windows.start[:, None], (3, 7, 10), axis=-1)
-    start = InitialState(
+    position, quaternion, velocity, rates = np.split(start, (3, 7, 10), axis=-1)
+    initial = InitialState(
         position=position, quaternion=quaternion, velocity=velocity, body_rates=rates
     )
-    world.reset(np.ones((starts, 1), bool), start)
+    world.reset(np.ones((starts, 1), bool), initial)
     states = np.full((starts, len(windows.horizons), 13), _LOST)
     coefficient = each["rotors.thrust_coefficient"]
     state = world.state
     with suppress(PhysicsError):  # of numbers far off, which a fit tries
-        for step in range(windows.speeds.shape[1]):
-            thrust = coefficient * mean_speeds(windows.speeds, step) ** 2
+        for step in range(steps):
+            thrust = coefficient * mean_speeds(speeds, step) ** 2
             world.step(thrust[:, None], 1)
             if step + 1 in windows.horizons:
                 motion = (state.position, state.quaternion, state.velocity, state.body_rates)
                 horizon = windows.horizons.index(step + 1)
                 states[:, horizon] = np.concatenate(motion, axis=-1)[:, 0]
-    return states
+    return states.reshape(count, share, -1, 13)
 
 
 def _world(vehicle: Vehicle, numbers: Mapping[str, Floats], period: float) -> RigidWorld:
@@ -182,11 +180,11 @@ def _world(vehicle: Vehicle, numbers: Mapping[str, Floats], period: float) -> Ri
     model = copy.copy(vehicle.model)
     model.opt.timestep = period
     model.actuator_ctrlrange *= _MORE_THRUST
-    rotors = [replace(rotor, high=_MORE_THRUST * rotor.high) for rotor in vehicle.rotors]
+    high = _MORE_THRUST * vehicle.thrust_high
     coefficients = Coefficients(vehicle.coefficients)
     coefficients |= dict.fromkeys(_REPLACED)  # the numbers take their place
     coefficients |= {"drag.linear": (0.0, 0.0, 0.0), "rotors.drag": 0.0}
-    free = replace(vehicle, model=model, rotors=tuple(rotors), coefficients=coefficients)
+    free = replace(vehicle, model=model, thrust_high=high, coefficients=coefficients)
     has_rotor_drag = any(numbers[name].any() for name in _ON_ROTORS)
     effects = EffectOptions(body_drag=True, rotor_drag=has_rotor_drag)
     count = len(numbers["rotors.drag"])

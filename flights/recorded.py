@@ -35,8 +35,6 @@ def recorded_trajectories(
         InputError: It is no journal, or has no such session, drone or episode.
         OSError: It cannot be read.
     """
-    if not path.is_file():
-        raise InputError(f"{path}: expected a journal (.mcap), got no such file")
     sessions: list[Session] = []
     found: Flights = []
     for one in read_episodes(path, drone, observations=observations):

@@ -2,7 +2,7 @@
 
 import base64
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from functools import lru_cache
 from pathlib import Path, PurePosixPath
 from tempfile import TemporaryDirectory
@@ -10,9 +10,8 @@ from tempfile import TemporaryDirectory
 import mujoco
 
 from .errors import InputError, shortened
-from .files import find_in_package
 from .library import find_vehicle
-from .mjcf import read_xml
+from .mjcf import asset_files, read_spec
 from .vehicle_file import model_of
 
 MAX_BYTES = 1 << 26
@@ -26,7 +25,7 @@ def read_bundle(vehicle: Path | str) -> Bundle:
     """A vehicle's file, and all files that it names by relative paths. Raises `InputError`."""
     path = find_vehicle(vehicle)
     try:
-        files = list(dict.fromkeys([path, *_with_assets(model_of(path))]))
+        files = list(dict.fromkeys([path, *_with_assets(path)]))
         size = sum(file.stat().st_size for file in files)
         if size > MAX_BYTES:
             raise InputError(f"vehicle: expected files of at most {MAX_BYTES} bytes, got {size}")
@@ -39,11 +38,18 @@ def read_bundle(vehicle: Path | str) -> Bundle:
     return tuple(zip(names, contents, strict=True))
 
 
-def checked_bundles(given: object) -> dict[str, Bundle]:
+def checked_bundles(given: Mapping[str, Bundle]) -> dict[str, Bundle]:
     """Bundles of JSON, or of a config. Raises `InputError`."""
-    if not isinstance(given, Mapping):
-        raise InputError(f"files: expected those of each vehicle, got {shortened(given)}")
-    return {str(word): _checked(pairs) for word, pairs in given.items()}
+    try:
+        bundles = {word: tuple(map(_checked, pairs)) for word, pairs in given.items()}
+    except (AttributeError, TypeError, ValueError):
+        bundles = {"": ()}
+    if not all(bundles.values()):
+        raise InputError(
+            "files: expected relative paths and contents in base64 of each vehicle, "
+            f"got {shortened(given)}"
+        )
+    return bundles
 
 
 def unpacked(vehicle: str, bundle: Bundle) -> Path:
@@ -67,55 +73,31 @@ def written(bundle: Bundle) -> TemporaryDirectory[str]:
     return folder
 
 
-def _checked(given: object) -> Bundle:
-    if not isinstance(given, list | tuple) or not given:
-        raise InputError(f"files: expected a list of paths and contents, got {shortened(given)}")
-    for pair in given:
-        if not _is_file(pair):
-            raise InputError(f"files: expected a relative path and base64, got {shortened(pair)}")
-    return tuple((name, content) for name, content in given)
+def _checked(pair: tuple[str, str]) -> tuple[str, str]:
+    """A relative path that stays in its folder, on every system, and base64. Raises `ValueError`
+    or `TypeError` for another pair.
+    """
+    name, content = pair
+    path = PurePosixPath(name)
+    base64.b64decode(content, validate=True)
+    leaves = path.is_absolute() or ".." in path.parts or not {"\\", ":", "\0"}.isdisjoint(name)
+    if leaves or not path.parts:
+        raise ValueError
+    return name, content
 
 
-def _is_file(pair: object) -> bool:
-    """Whether it is base64 behind a relative path that stays in its folder, on every system."""
-    if not isinstance(pair, list | tuple):
-        return False
-    try:
-        name, content = pair
-        path = PurePosixPath(name)
-        base64.b64decode(content, validate=True)
-    except (TypeError, ValueError):
-        return False
-    inside = bool(path.parts) and not path.is_absolute() and ".." not in path.parts
-    return inside and not {"\\", ":", "\0"} & set(name)
-
-
-def _with_assets(model: Path) -> list[Path]:
-    """An MJCF or URDF file, and the files that it names and that are there.
+def _with_assets(vehicle: Path) -> list[Path]:
+    """The MJCF or URDF file of a vehicle, and the files that it names and that are there.
 
     Absolute paths are left out: they are the same elsewhere, or MuJoCo names them there.
     """
-    if model.suffix.lower() == ".urdf":
-        return [model, *_meshes(model)]
+    model = model_of(vehicle)
     try:
+        if model.suffix.lower() == ".urdf":
+            return [model, *asset_files(read_spec(vehicle), model.parent)]
         names = mujoco.mju_getXMLDependencies(os.path.relpath(model))
-    except mujoco.FatalError:  # MuJoCo says what is wrong when it reads the model
+    except (ValueError, mujoco.FatalError):  # the reader of the model says what is wrong
         return [model]
     # Without `..`, and with links as they are: the files keep their places to each other.
     files = [Path(os.path.abspath(name)) for name in sorted(names) if not os.path.isabs(name)]
     return [file for file in files if file.is_file()]
-
-
-def _meshes(urdf: Path) -> Iterator[Path]:
-    """The meshes of a URDF file, by the rules of MuJoCo and of URDF's packages."""
-    elements = list(read_xml(urdf).iter())
-    folders = [urdf.parent / element.get("meshdir", "") for element in elements]
-    for name in filter(None, (element.get("filename") for element in elements)):
-        if name.startswith("package://"):
-            found = [find_in_package(name, urdf.parent)]
-        else:  # MuJoCo strips the folders
-            found = [folder / way for folder in folders for way in (name, Path(name).name)]
-        for file in found:
-            if file is not None and file.is_file() and not os.path.isabs(name):
-                yield Path(os.path.abspath(file))
-                break

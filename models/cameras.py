@@ -17,7 +17,7 @@ from mujoco import MjData, MjModel, MjSpec
 
 from .coefficients import PREFIX
 from .errors import InputError, shortened
-from .fields import Direction, Limits, Text, check, immutable
+from .fields import Direction, Limits, Text, check_fields, immutable
 
 OUTPUTS = {
     "rgb": mujoco.mjtCamOutBit.mjCAMOUT_RGB,
@@ -33,10 +33,9 @@ MAX_PIXELS = 4096  # of a side
 _TEXTS = PREFIX + "cameras."
 _MAX_LETTERS = 64  # of a name
 _NAME = Text(rf"[^\W\d]\w{{,{_MAX_LETTERS - 1}}}", f"up to {_MAX_LETTERS} letters, digits and _")
-_FOVY = Limits(1e-3, 3.0, "rad")
-_DEGREES = Limits(math.degrees(_FOVY.low), math.degrees(_FOVY.high), "degrees")
 _RESOLUTION = Limits(1, MAX_PIXELS, "pixel", whole=True, count=2)
 _DEFAULT_RESOLUTION = (64, 64)
+_KINDS = Text("|".join(OUTPUTS), f"some of {', '.join(OUTPUTS)}", several=True)
 _MAX_STEPS = 1000  # from picture to picture
 
 ORIGIN = (0.0, 0.0, 0.0)
@@ -52,22 +51,25 @@ class Camera:
     """A camera of a vehicle, or of its world: a table of a TOML file."""
 
     name: Annotated[str, _NAME]
-    position: Place = ORIGIN
+    position: Annotated[_Vector, Limits(-1e4, 1e4, "m", count=3)] = ORIGIN
     """In the body frame, or the world's if it stands there, m."""
     look: Axis = AHEAD
     """Direction in which it looks, in the same frame."""
     up: Axis = UP
     """Direction of the picture's upper edge, in the same frame."""
-    fovy: Annotated[float, _FOVY] = math.pi / 2
+    fovy: Annotated[float, Limits(1e-3, 3.0, "rad")] = math.pi / 2
     """Vertical field of view, rad."""
     resolution: Annotated[tuple[int, int], _RESOLUTION] = _DEFAULT_RESOLUTION
     """Width and height, pixels."""
     rate: Annotated[float, Limits(1e-3, 1.0, "1")] = 1.0
     """Pictures per control step, 1 over a whole number."""
-    kinds: tuple[str, ...] = ("rgb",)
+    kinds: Annotated[tuple[str, ...], _KINDS] = ("rgb",)
     """What it takes: some of `OUTPUTS`."""
     stands: bool = False
     """Whether it stands in the world; else a drone carries it."""
+
+    def __post_init__(self) -> None:
+        check_fields(self, f"camera {self.name}.")
 
     @property
     def width(self) -> int:
@@ -184,7 +186,9 @@ def read_cameras(spec: MjSpec, model: MjModel, data: MjData) -> tuple[Camera, ..
         usable = usable and model.cam_projection[number] == perspective.value
         if not usable or one.mode in targets:
             continue
-        _check_numbers(f"camera {one.name}", model, number)
+        focal = model.cam_intrinsic[number, :2].tolist()
+        if model.cam_sensorsize[number].any() and not min(focal) > 0:
+            raise InputError(f"camera {one.name}: expected a focal length above 0, got {focal}")
         resolution = model.cam_resolution[number].tolist()
         if resolution == [1, 1]:  # MJCF's default
             resolution = _DEFAULT_RESOLUTION
@@ -199,7 +203,7 @@ def read_cameras(spec: MjSpec, model: MjModel, data: MjData) -> tuple[Camera, ..
                 look=_vector(-axes[:, 2]),
                 up=_vector(axes[:, 1]),
                 fovy=math.radians(one.fovy[0]),
-                resolution=check(f"camera {one.name}.resolution", _RESOLUTION, resolution),
+                resolution=resolution,
                 rate=1 / steps_of(f"camera {one.name}", rate),
                 kinds=tuple(kind for kind, bit in OUTPUTS.items() if output & bit) or ("rgb",),
                 stands=bool(not mine or one.mode != modes.mjCAMLIGHT_FIXED.value),
@@ -217,18 +221,6 @@ def place_cameras(model: MjModel, data: MjData) -> None:
     mujoco.mj_camlight(model, data)
 
 
-def _check_numbers(name: str, model: MjModel, number: int) -> None:
-    """Raise `InputError` unless a camera of a model can see something."""
-    focal = model.cam_intrinsic[number, :2].tolist()
-    sensor = model.cam_sensorsize[number]
-    if sensor.any() and not min(*focal, *sensor) > 0:
-        raise InputError(
-            f"{name}: expected a focal length above 0 with its sensorsize, got {focal}"
-        )
-    check(f"{name}.fovy", _DEGREES, float(model.cam_fovy[number]))
-    check(f"{name}.pos", Limits(-1e4, 1e4, "m", count=3), model.cam_pos[number].tolist())
-
-
 def steps_of(name: str, rate: str | float) -> int:
     """Control steps between the pictures of a camera at a rate. Raises `InputError`."""
     try:
@@ -243,7 +235,8 @@ def steps_of(name: str, rate: str | float) -> int:
 
 
 def _vector(values: np.ndarray) -> _Vector:
-    x, y, z = (float(round(one, 9)) + 0.0 for one in values)
+    with np.errstate(over="ignore"):
+        x, y, z = (float(round(one, 9)) + 0.0 for one in values)
     return x, y, z
 
 
@@ -264,11 +257,11 @@ def own_cameras(radius: float, rest_height: float) -> tuple[Camera, ...]:
     )
 
 
-def place_camera(spec: MjSpec, body: mujoco.MjsBody, camera: Camera) -> None:
-    """Add a camera to a body of a spec; its rate is a custom text."""
+def place_camera(spec: MjSpec, body: mujoco.MjsBody, camera: Camera, prefix: str = "") -> None:
+    """Add a camera to a body of a spec, its name with a prefix; its rate is a custom text."""
     right = np.cross(camera.look, camera.up)
     body.add_camera(
-        name=camera.name,
+        name=prefix + camera.name,
         pos=camera.position,
         xyaxes=np.concatenate((right, np.cross(right, camera.look))),
         fovy=math.degrees(camera.fovy),

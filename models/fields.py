@@ -179,7 +179,7 @@ class Text:
 
     def read(self, value: Any) -> object:
         words = value if self.several else (value,)
-        if not isinstance(words, tuple):
+        if not isinstance(words, tuple | list):
             raise TypeError
         if not all(re.fullmatch(self.pattern, word) for word in words):
             raise ValueError

@@ -3,7 +3,7 @@
 import copy
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
-from functools import cached_property, partial
+from functools import partial
 from hashlib import blake2b
 from pathlib import Path
 from typing import Any, Self
@@ -14,15 +14,19 @@ from .errors import InputError
 from .library import vehicle_words
 from .vehicle import Vehicle
 
+_OF_DRONES = (
+    "mass", "center_of_mass", "inertia", "thrust_low", "thrust_high", "allocation", "hover_thrust",
+)  # fmt: skip
+
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Fleet(Vehicle):
     """A vehicle for each of A drones, in the place of one for all.
 
     What belongs to a drone is an array with the first axis A: `mass` (A,), `center_of_mass` (A, 3),
-    `inertia` (A, 3, 3), `allocation` (A, 4, R), `hover_thrust` (A, R). Radius and height at rest
-    are the largest of all, accelerations the least. The model, its path and the coefficients are
-    those of the first.
+    `inertia` (A, 3, 3), `allocation` (A, 4, R), `thrust_low`, `thrust_high` and `hover_thrust`
+    (A, R). Radius and height at rest are the largest of all, accelerations the least. The model,
+    its path and the coefficients are those of the first.
     """
 
     members: tuple[Vehicle, ...]
@@ -46,28 +50,14 @@ class Fleet(Vehicle):
         values: dict[str, Any] = {
             one.name: getattr(members[0], one.name) for one in fields(Vehicle)
         }
-        for name in ("mass", "center_of_mass", "inertia", "allocation", "hover_thrust"):
+        for name in _OF_DRONES:
             values[name] = np.array([getattr(one, name) for one in members])
         values["name"] = ", ".join(dict.fromkeys(one.name for one in members))
         together = " ".join(one.hash for one in members)
         values["hash"] = blake2b(together.encode(), digest_size=16).hexdigest()
-        values["rest_height"] = max(one.rest_height for one in members)
+        for name in ("radius", "rest_height"):
+            values[name] = max(getattr(one, name) for one in members)
         return cls(**values, members=members)
-
-    @cached_property
-    def thrust_low(self) -> np.ndarray:
-        """Least thrust of each rotor, shape (A, R), N."""
-        return np.array([one.thrust_low for one in self.members])
-
-    @cached_property
-    def thrust_high(self) -> np.ndarray:
-        """Largest thrust of each rotor, shape (A, R), N."""
-        return np.array([one.thrust_high for one in self.members])
-
-    @cached_property
-    def radius(self) -> float:
-        """Of the sphere of the largest, m."""
-        return max(one.radius for one in self.members)
 
     @property
     def max_acceleration(self) -> float:

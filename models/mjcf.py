@@ -1,6 +1,7 @@
 """Specs of vehicles' files: read, bounded in size, with level ground, several craft in one."""
 
 import math
+import os
 from collections.abc import Sequence
 from pathlib import Path
 from xml.etree import ElementTree
@@ -40,6 +41,13 @@ def vehicle_spec(path: Path) -> MjSpec:
     add_ground(spec)
     spec.compiler.discardvisual = True
     return spec
+
+
+def asset_files(spec: MjSpec, folder: Path) -> list[Path]:
+    """Files of meshes and height fields that are there, of a model in a folder."""
+    assets = (*spec.meshes, *spec.hfields)
+    files = [folder / spec.meshdir / asset.file for asset in assets if asset.file]
+    return [Path(os.path.abspath(file)) for file in files if file.is_file()]
 
 
 def has_ground(spec: MjSpec) -> bool:

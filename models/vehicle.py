@@ -24,7 +24,7 @@ from .errors import InputError, one_line
 from .fields import Limits, check, immutable
 from .library import find_vehicle
 from .matrices import inverse, product, right_inverse, settled
-from .mjcf import level_data, vehicle_spec
+from .mjcf import asset_files, level_data, vehicle_spec
 from .vehicle_file import inertia_matrix, model_of, read_vehicle_file
 
 Array = np.ndarray
@@ -85,11 +85,17 @@ class Vehicle:
     inertia: Array
     """About the center of mass, body axes, shape (3, 3), kg·m²."""
     rotors: tuple[Rotor, ...]
+    thrust_low: Array
+    """Least thrust of each rotor, shape (R,), N."""
+    thrust_high: Array
+    """Largest thrust of each rotor, shape (R,), N."""
     allocation: Array
     """Effect of one newton of each rotor, shape (4, R): thrust along body z (N), and torque about
     body x, y and z at the center of mass (N·m)."""
     hover_thrust: Array
     """Thrusts at which the level craft neither moves nor turns, all above 0, shape (R,), N."""
+    radius: float
+    """Of a sphere about the body's origin that holds all that can collide, m."""
     rest_height: float
     """Height of the body's origin when it touches level ground, m."""
     coefficients: Coefficients
@@ -122,26 +128,6 @@ class Vehicle:
     def num_rotors(self) -> int:
         """R."""
         return len(self.rotors)
-
-    @cached_property
-    def thrust_low(self) -> Array:
-        """Least thrust of each rotor, shape (R,), N."""
-        return np.array([rotor.low for rotor in self.rotors])
-
-    @cached_property
-    def thrust_high(self) -> Array:
-        """Largest thrust of each rotor, shape (R,), N."""
-        return np.array([rotor.high for rotor in self.rotors])
-
-    @cached_property
-    def radius(self) -> float:
-        """Of a sphere about the body's origin that holds all that can collide, m."""
-        model = self.model
-        data = level_data(model)
-        solid = craft_geoms(model)
-        solid &= (model.geom_contype | model.geom_conaffinity) > 0
-        reach = np.linalg.norm(data.geom_xpos, axis=1) + model.geom_rbound
-        return float(settled(reach[solid].max(initial=1e-3)))
 
     @cached_property
     def cameras(self) -> tuple[Camera, ...]:
@@ -306,8 +292,11 @@ def _load(path: Path, drag: float, changed: tuple[int, ...]) -> Vehicle:
         center_of_mass=center,
         inertia=settled(inertia, inertia.max()),
         rotors=rotors,
+        thrust_low=np.array([rotor.low for rotor in rotors]),
+        thrust_high=np.array([rotor.high for rotor in rotors]),
         allocation=allocation,
         hover_thrust=_hover(rotors, allocation, mass * gravity),
+        radius=_radius(model),
         rest_height=_find_rest_height(model, data),
         coefficients=_read_coefficients(model),
         file_cameras=cameras,
@@ -402,6 +391,14 @@ def _hover(rotors: tuple[Rotor, ...], allocation: Array, weight: float) -> Array
     return thrust
 
 
+def _radius(model: MjModel) -> float:
+    """Of a sphere about the body's origin that holds all that can collide, m."""
+    solid = craft_geoms(model)
+    solid &= (model.geom_contype | model.geom_conaffinity) > 0
+    reach = np.linalg.norm(level_data(model).geom_xpos, axis=1) + model.geom_rbound
+    return float(settled(reach[solid].max(initial=1e-3)))
+
+
 def _find_rest_height(model: MjModel, data: MjData) -> float:
     """Height at which the level body first touches anything, by bisection; 0 if it never does.
 
@@ -433,11 +430,8 @@ def _touches(model: MjModel, data: MjData, height: float) -> bool:
 
 def _hash(spec: MjSpec, text: str, path: Path, drag: float) -> str:
     digest = blake2b(text.encode() + b"\0" + struct.pack("<d", drag), digest_size=16)
-    folder = model_of(path).parent
     if path.suffix.lower() == ".toml":
         digest.update(read_vehicle_file(path).content.encode())
-    for asset in (*spec.meshes, *spec.hfields):
-        file = folder / spec.meshdir / asset.file
-        if asset.file and file.is_file():
-            digest.update(file.read_bytes())
+    for file in asset_files(spec, model_of(path).parent):
+        digest.update(file.read_bytes())
     return digest.hexdigest()

@@ -8,7 +8,6 @@ A camera's frame here: x right, y down, z along its axis, as in computer vision.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from functools import cached_property
 from typing import NamedTuple
 
@@ -16,7 +15,6 @@ import mujoco
 import numpy as np
 from mujoco import MjModel, MjsBody
 
-from ..models import InputError
 from ..models.cameras import FARTHEST, View, place_camera, place_cameras
 from ..models.fleet import members_of
 from ..models.mjcf import swarm_spec
@@ -79,8 +77,6 @@ class Cameras:
         payload: bool = False,
         fine: bool = False,
     ) -> None:
-        if not views:
-            raise InputError("cameras: expected one picture or more, got none")
         self.views = tuple(views)
         self._shape = shape
         names = drone_names(shape[1])
@@ -266,7 +262,7 @@ def drawn_model(
     for name, body, craft in zip(names, bodies, crafts, strict=True):
         for camera in craft.cameras:
             if camera not in craft.file_cameras:
-                place_camera(spec, body, replace(camera, name=f"{name}/{camera.name}"))
+                place_camera(spec, body, camera, f"{name}/")
     if payload:
         hung = spec.worldbody.add_body(name=PAYLOAD, mocap=True)
         _add(hung, PAYLOAD, "sphere", (0.12 * crafts[0].radius,) * 3)

@@ -20,7 +20,7 @@ Lines = Sequence[tuple[str, str]]
 _LARGE = 480  # pixels: higher pictures have large letters
 _ROOM = 10_000  # geoms beyond those of the model
 _SAMPLES = 4  # of every pixel, for smooth edges; software has no more
-_LIBRARIES = {"egl": "EGL", "osmesa": "OSMesa", "cgl": "OpenGL"}
+_LIBRARIES = ("egl", "osmesa", "cgl", "glfw", "disable")
 _HIDDEN = "ROTORGRAM_GL"
 """Keeps `MUJOCO_GL` as the user set it while `hidden_gl_setting` hides it from MuJoCo. An
 environment variable, so that the processes that this one starts know it too."""
@@ -35,21 +35,11 @@ if hasattr(os, "register_at_fork"):
 
 @contextmanager
 def hidden_gl_setting() -> Iterator[None]:
-    """Let MuJoCo be imported without an OpenGL, also where `MUJOCO_GL` names one that is not there.
+    """Let MuJoCo be imported without an OpenGL, whatever `MUJOCO_GL` names.
 
     Otherwise MuJoCo imports one, which takes a tenth of a second, and raises where that fails.
     """
-    wanted = _wanted()
-    library = _LIBRARIES.get(wanted)
-    is_there = wanted in ("disable", "glfw")
-    if library:
-        from ctypes.util import find_library  # slow to import, for the few who set MUJOCO_GL
-
-        is_there = find_library(library) is not None
-    if is_there:
-        yield
-        return
-    hidden = {_HIDDEN: wanted, "MUJOCO_GL": "disable"}
+    hidden = {_HIDDEN: _wanted(), "MUJOCO_GL": "disable"}
     before = {name: os.environ[name] for name in hidden if name in os.environ}
     os.environ |= hidden
     try:
@@ -195,6 +185,6 @@ def _library() -> str:
     wanted = _wanted()
     if not wanted:
         return {"linux": "egl", "darwin": "cgl"}.get(sys.platform, "glfw")
-    if wanted not in (*_LIBRARIES, "glfw", "disable"):
+    if wanted not in _LIBRARIES:
         raise NoOpenGL(f"MUJOCO_GL: expected egl, osmesa, glfw or disable, got {shortened(wanted)}")
     return wanted

@@ -1,6 +1,5 @@
 """Moments of flights, the stage that shows them with goals, paths and cameras, and its pictures."""
 
-import copy
 import math
 from collections import deque
 from collections.abc import Sequence
@@ -48,7 +47,8 @@ _ONBOARD = "stage/onboard"
 _SIDES = Limits(16, 8192, "pixels", whole=True)
 
 # Lengths below are in radii of the craft.
-_SPACING = 2.2  # between the craft of a world before their first moments
+_SEAT = (0.03, 0.0, 0.3)  # of the camera on board, above the canopies of all vehicles
+_SPREAD = 8.8  # of the craft of a world, which are about as many in each direction
 _NEAR = 0.14  # at most: where drawing begins
 _LOWER = 0.06  # of their distance front and side look below the goal
 _BACK = 2.6  # distance of a camera per distance between craft and goal
@@ -163,36 +163,21 @@ class Stage:
                 f"vehicle: expected a file that can be drawn, got: {one_line(error)}"
             ) from None
         self._moving = MovingGeoms(self.model, scene)
-        self.radius, top = _size(self.model)
-        onboard = (0.03 * self.radius, 0.0, top + 0.154 * self.radius)
-        self.model.camera(_ONBOARD).pos = onboard
-        self._grid = _grid(drones, _SPACING * self.radius)
-        apart = float(np.ptp(self._grid, axis=0).max())
-        scale_drawing(self.model, self.radius, 4.0 * apart)  # in flight they are further apart
-        self._length = _TRAIL // _EVERY if trail else 0
-        self._clear()
-
-    def _clear(self) -> None:
+        self.radius = _drawn_radius(self.model)
+        self.model.camera(_ONBOARD).pos = np.multiply(_SEAT, self.radius)
+        spread = _SPREAD * math.isqrt(drones - 1) * self.radius
+        scale_drawing(self.model, self.radius, spread)
         self.data = mujoco.MjData(self.model)
-        self._points[:] += self._grid
         self.moments: tuple[Moment, ...] = ()
-        drones = range(self.drones)
-        self._paths: list[deque[Array]] = [deque(maxlen=self._length) for _ in drones]
+        length = _TRAIL // _EVERY if trail else 0
+        self._paths: list[deque[Array]] = [deque(maxlen=length) for _ in range(drones)]
         # Distance between a single craft and its goal for which a camera makes room, m.
         self._reach = 0.0
         self._focus: Array | None = None
         mujoco.mj_forward(self.model, self.data)
 
-    def twin(self) -> "Stage":
-        """A stage of the same model, with poses and paths of its own: one canvas draws both."""
-        twin = copy.copy(self)
-        twin._clear()
-        return twin
-
     def show(self, *moments: Moment) -> None:
         """Put every craft where its moment has it, and extend its path. Raises `InputError`."""
-        if len(moments) != self.drones:
-            raise InputError(f"moments: expected {self.drones}, got {len(moments)}")
         craft = self.vehicle
         rotors = len(moments[0].thrusts)
         if rotors != craft.num_rotors:
@@ -348,22 +333,17 @@ class Canvas(AbstractContextManager["Canvas"]):
         check_fields(self)
         self._drawing = Offscreen(self.stage.model, self.width, self.height, fine=not self.fast)
 
-    def draw(
-        self, camera: Camera = "chase", stage: Stage | None = None, lines: Lines = ()
-    ) -> Array:
-        """The stage, or a twin of it, as it is now, with lines of text over it: a new array, uint8,
-        (height, width, 3).
+    def draw(self, camera: Camera = "chase", lines: Lines = ()) -> Array:
+        """The stage as it is now, with lines of text over it: a new array, uint8, (height, width,
+        3).
         """
-        stage = stage or self.stage
-        if stage.model is not self.stage.model:
-            raise ValueError("stage: expected the canvas's own or a twin of it, got another")
         scene = self._drawing.scene
-        self._drawing.update(stage.data, stage.camera(camera))
+        self._drawing.update(self.stage.data, self.stage.camera(camera))
         for light in scene.lights[: scene.nlight]:
             if light.headlight and camera == "top":  # it would add itself to the sun
                 light.diffuse[:] = 0.0
         # From on board, at the goal, its disc would fill the lower half.
-        stage.decorate(scene, goals=camera != "onboard")
+        self.stage.decorate(scene, goals=camera != "onboard")
         pixels = np.empty((self.height, self.width, 3), np.uint8)
         self._drawing.draw(pixels, lines=lines)
         return np.ascontiguousarray(pixels[::-1])  # OpenGL's first row is the lowest
@@ -376,21 +356,14 @@ class Canvas(AbstractContextManager["Canvas"]):
         self.close()
 
 
-def _size(model: MjModel) -> tuple[float, float]:
-    """Radius of the largest craft about its body's origin, and height of the tops above it, m."""
+def _drawn_radius(model: MjModel) -> float:
+    """Of a sphere about the body's origin that holds what is drawn of the largest craft, m."""
     data = level_data(model)
     craft = owners(model)[model.geom_bodyid] >= 0
     drawn = craft & (model.geom_group <= 2)
     chosen = drawn if drawn.any() else craft
-    if not chosen.any():
-        return 1.0, 0.0
-    centres = data.geom_xpos[chosen]
-    bounds = model.geom_rbound[chosen]
-    boxes = model.geom_aabb[chosen]
-    rows = data.geom_xmat[chosen, 6:]  # of z in body axes
-    tops = centres[:, 2] + (rows * boxes[:, :3] + abs(rows) * boxes[:, 3:]).sum(axis=1)
-    radius = float((np.linalg.norm(centres, axis=1) + bounds).max())
-    return max(radius, 1e-3), float(tops.max())
+    reach = np.linalg.norm(data.geom_xpos, axis=1) + model.geom_rbound
+    return float(reach[chosen].max(initial=1e-3))
 
 
 def scale_drawing(model: MjModel, radius: float, spread: float) -> None:
@@ -406,12 +379,6 @@ def scale_drawing(model: MjModel, radius: float, spread: float) -> None:
         model.mat_texrepeat[floor] *= 10.0 ** -round(math.log10(radius))
         # Further out the floor would shade itself, in speckles.
         visual.map.shadowclip = min(visual.map.shadowclip, (2.0 * radius + spread) / extent)
-
-
-def _grid(drones: int, spacing: float) -> Array:
-    """Places of the craft, shape (drones, 3), m: nearly a square, the first at the origin."""
-    rows, columns = np.divmod(np.arange(drones), math.isqrt(drones - 1) + 1)
-    return -spacing * np.stack((rows, columns, np.zeros(drones)), axis=1)
 
 
 def _draw_mark(scene: MjvScene, mark: Mark, goal: Point | None) -> None:

@@ -37,7 +37,6 @@ _WEYL = (0x9E3779B9, 0xBB67AE85)
 _ROUNDS = 10
 _UNIT = 2.0**-32
 _TURN = 6.283185307179586
-_AHEAD = 256  # Most rows of numbers that are drawn ahead, over all worlds
 
 
 @once(vectors=1)
@@ -200,8 +199,6 @@ class Draw:
 class Noise(Kept):
     """Standard normal numbers of each drone in every step: `Random.noise` makes it.
 
-    Steps are drawn ahead: that is a cache and no state.
-
     Attributes:
         step: Number of each world's next step in its episode, shape (W,).
     """
@@ -214,8 +211,6 @@ class Noise(Kept):
         self._random = random
         self._use = use
         self._size = size
-        self._ahead = max(1, _AHEAD // worlds)
-        self._of: Array = None  # the key of each row, its episode and its steps
 
     def begin(self, begun: Array) -> None:
         """An episode of some worlds begins, bool, (W,)."""
@@ -228,31 +223,8 @@ class Noise(Kept):
         """
         random = self._random
         worlds = random.worlds(mask)
-        if is_traced(worlds):
-            drawn = self._drawn(random.keys, random.episode, self.step)
-        else:
-            drawn = self._drawn_ahead()
+        count = random.drones * self._size
+        words = words_of(random.keys, self._use, random.episode, self.step, count + count % 2)
+        drawn = normal(words)[..., :count].reshape(-1, random.drones, self._size)
         self.step = np.where(worlds, self.step + np.uint32(1), self.step)
         return np.where(worlds[:, None, None], drawn, 0.0)
-
-    def _drawn_ahead(self) -> Numbers:
-        """As `_drawn`, of the present step."""
-        random = self._random
-        ahead = self._ahead
-        row = self.step % np.uint32(ahead)
-        first = self.step - row
-        now = np.stack((*random.keys.T, random.episode, first))
-        if not np.array_equal(now, self._of):
-            self._of = now
-            steps = first[:, None] + np.arange(ahead, dtype=np.uint32)
-            keys = np.repeat(random.keys[:, None], ahead, axis=1)
-            self._rows = self._drawn(keys, random.episode[:, None], steps)
-        numbers: Numbers = self._rows[np.arange(len(row)), row]
-        return numbers
-
-    def _drawn(self, keys: Array, episodes: Array, steps: Array) -> Numbers:
-        """Numbers of steps (...), shape (..., A, size)."""
-        drones = self._random.drones
-        count = drones * self._size
-        words = words_of(keys, self._use, episodes, steps, count + count % 2)
-        return normal(words)[..., :count].reshape(*steps.shape, drones, self._size)

@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 
 from .. import models
-from ..models import BACKENDS, MAX_DRONES, Backend
+from ..models import Backend
 from ..models.errors import InputError, NotCopied
-from ..models.fields import Choice, Flag, Limits, OrNone, Rule, check, immutable
+from ..models.fields import immutable
 from ..scenes import SceneConfig
 from .compile.llvm import trouble
 from .effects import NO_EFFECTS, EffectOptions, Effects
@@ -25,11 +25,8 @@ if TYPE_CHECKING:
 
 _CLASSES = {"mujoco": "MujocoWorld", "rigid": "RigidWorld"}
 """Backends by name: a class in the module of that name in `backends`."""
-_SETTINGS: Mapping[str, Mapping[str, Rule]] = {
-    "mujoco": {"num_threads": Limits(0, whole=True), "compiled": OrNone(Flag())},
-    "rigid": {"dtype": Choice(("float32", "float64")), "compiled": OrNone(Flag())},
-}
-"""Rules of each backend's own arguments of `make_world`, by name."""
+_OF_ONE = {"num_threads": "mujoco", "dtype": "rigid"}
+"""Arguments of `make_world` that only one backend has."""
 
 MAX_WORLDS = 1 << 16  # Most worlds of a batch
 CONTACT_CHECK = 0.02
@@ -318,16 +315,11 @@ class World(NotCopied):
 def check_world(
     vehicle: "models.Vehicle",
     backend: Backend,
-    drones: int,
     effects: EffectOptions,
     randomize: Randomization,
     settings: Mapping[str, Any],
 ) -> None:
     """Refuse by name what the backend cannot honour. Raises `InputError`."""
-    if backend not in BACKENDS:
-        raise InputError(f"backend: expected {' or '.join(BACKENDS)}, got {backend!r}")
-    if not (type(drones) is int and 1 <= drones <= MAX_DRONES):
-        raise InputError(f"drones: expected 1 to {MAX_DRONES}, got {drones!r}")
     if getattr(vehicle, "members", ()):
         if backend != "mujoco":
             raise InputError(
@@ -340,14 +332,9 @@ def check_world(
                 "effects and randomize: expected none with several vehicles, "
                 f"got {', '.join(refused)}"
             )
-    known = _SETTINGS[backend]
     for name, value in settings.items():
-        if name not in known:
-            raise InputError(
-                f"{name}: expected {' or '.join(known)} with the backend {backend}, "
-                f"got {name}={value!r}"
-            )
-        check(name, known[name], value)
+        if _OF_ONE.get(name, backend) != backend:
+            raise InputError(f"{name}: expected none with the backend {backend}, got {value!r}")
 
 
 def make_world(
@@ -368,7 +355,7 @@ def make_world(
     """
     if not (type(num_worlds) is int and 1 <= num_worlds <= MAX_WORLDS):
         raise InputError(f"num_envs: expected 1 to {MAX_WORLDS}, got {num_worlds!r}")
-    check_world(vehicle, backend, drones, effects, randomize, settings)
+    check_world(vehicle, backend, effects, randomize, settings)
     wanted = settings.pop("compiled", None)
     reason = "" if wanted is False else trouble()
     if wanted and reason:

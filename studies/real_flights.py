@@ -337,7 +337,7 @@ def _unseen(
         windows = Windows.cut(rest, HORIZONS[-1], 2 * _STRIDE, (10, 25, 50))
         numbers = _flown(variant, _fitted(variant, base, held, windows, rest))
         cut = Windows.cut(left, HORIZONS[-1], _STRIDE // 2)
-        sizes = _sizes(predict(base, [numbers], cut), cut.truth)
+        sizes = _sizes(predict(base, [numbers], cut)[0], cut.truth)
         errors.append(sizes.mean(axis=(0, 1)))
     return [float(x) for x in np.mean(errors, axis=0)]
 

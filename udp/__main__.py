@@ -14,7 +14,6 @@ from threading import Thread
 from typing import Any
 
 from ..envs import registry
-from ..envs.compiled import import_ahead
 from ..envs.config import EnvConfig
 from ..models.errors import InputError, MissingPackage, NoOpenGL, shortened
 from .protocol.client import LinkConfig
@@ -29,7 +28,6 @@ def main() -> int:
     """Fly until the agent closes. Exit status 1 and one sentence if it fell silent."""
     # The agent closes the exchange; Ctrl-C in a terminal is meant for it.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    import_ahead()  # beside the agent, which imports what it needs
     try:
         env, settings = read_arguments(sys.stdin.buffer.readline())
         with Simulator(env, config=LinkConfig(timeout=_FOR_EVER), **settings) as simulator:

@@ -2,23 +2,26 @@
 
 import atexit
 import json
+import os
 import subprocess
+import sys
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
-from typing import Any
+from tempfile import TemporaryFile
+from typing import IO, Any
 
 from ..envs import registry
 from ..envs.config import EnvConfig
 from ..models import InputError
-from .process import begin, started
 from .protocol.client import Address
 from .protocol.errors import PeerClosed, PeerSilent
 from .remote import RemoteEnv, RemoteVectorEnv
 from .transport.agent import AgentSettings
 
 Remote = RemoteEnv | RemoteVectorEnv
+_COMMAND = (sys.executable, "-P", "-m", "rotorgram.udp")
 _START_TIMEOUT = 60.0
 _ANSWER_TIMEOUT = 10.0
 _STOP_TIMEOUT = 5.0
@@ -61,10 +64,9 @@ def spawn_simulator(
         env = RemoteVectorEnv(
             here, num_envs=count, autoreset_mode="Disabled", connect=False, **settings
         )
-    process, said = started()
-    with said:
+    with TemporaryFile("w+") as said:
+        process = start_simulator(config, env.address, said, num_envs=count)
         try:
-            _tell(process, config, env.address, num_envs=count)
             _connect(env, process)
             yield env
         except PeerSilent as error:
@@ -86,21 +88,19 @@ def spawn_simulator(
 
 
 def start_simulator(
-    config: EnvConfig, server: Address, **settings: object
+    config: EnvConfig, server: Address, stderr: IO[str] | None = None, **settings: object
 ) -> subprocess.Popen[bytes]:
     """A simulator in a process of its own, on a free port; it ends when its stdin is closed.
 
     `settings` are keyword arguments of `Simulator`.
     """
     _check_importable(config)
-    process = begin()
-    _tell(process, config, server, **settings)
-    return process
-
-
-def _tell(
-    process: subprocess.Popen[bytes], config: EnvConfig, server: Address, **settings: object
-) -> None:
+    # A second thread of torch makes small tensors slower, and takes the agent's core.
+    around = {"OMP_NUM_THREADS": "1", **os.environ, "PYTHONSAFEPATH": "1"}
+    # In a group of its own: a signal to ours is for the agent, which closes the exchange.
+    process = subprocess.Popen(
+        _COMMAND, stdin=subprocess.PIPE, stderr=stderr, env=around, process_group=0
+    )
     arguments = {
         "config": config.embedded().to_dict(),
         "module": config.module,
@@ -112,6 +112,7 @@ def _tell(
     with suppress(BrokenPipeError):  # it has ended: its exit status says so
         process.stdin.write(json.dumps(arguments).encode() + b"\n")
         process.stdin.flush()
+    return process
 
 
 def _check_importable(config: EnvConfig) -> None:

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ...models.errors import InputError
-from ...sim.state import Array, found, some
+from ...sim.state import Array, found
 from .record import Floats, Mask, Record, Stage
 
 
@@ -32,20 +32,15 @@ class Ends(Stage):
         terminated = np.zeros(record.shape, bool) | record.ended
         truncated = (record.steps >= self.episode_length) > terminated
         record.unfit = _unfit(record, reward)
-        flying = record.flown
-        if some(record.out):
-            flying = ~record.out if flying is None else flying & ~record.out
-        if flying is not None:
-            reward = np.where(flying | record.unfit, reward, 0.0)
-            terminated = terminated & flying
-            truncated = truncated & flying
+        flying = ~record.out if record.flown is None else record.flown & ~record.out
+        reward = np.where(flying | record.unfit, reward, 0.0)
+        terminated = terminated & flying
+        truncated = truncated & flying
         record.reward = reward
         refuse_unfit(record, self.env_id)
         record.terminated = terminated
         record.truncated = truncated
-        ends = terminated | truncated
-        if some(ends):
-            record.end(ends)
+        record.end(terminated | truncated)
 
 
 def refuse_unfit(record: Record, env_id: str) -> None:

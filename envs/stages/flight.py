@@ -6,7 +6,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from ...sim import Controller, World
-from ...sim.state import some
 from ...sim.world import Call
 from .record import Look, Record, Stage
 
@@ -100,5 +99,4 @@ class StandStill(Stage):
 
     def step(self, record: Record) -> None:
         """The thrust next to 0."""
-        if some(record.out):
-            record.thrust = np.where(record.out[..., None], self.rest, record.thrust)
+        record.thrust = np.where(record.out[..., None], self.rest, record.thrust)

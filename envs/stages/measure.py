@@ -7,7 +7,6 @@ import numpy as np
 from ...sim import World
 from ...sim.sensors import Sensors
 from ...sim.snapshots import Arrays
-from ...sim.state import some
 from ..spec import ArraySpec
 from ..state import kept_state, read_only
 from .record import Record, Stage
@@ -62,8 +61,7 @@ class Sensing(Stage):
         flown = record.flown
         if flown is None:
             flown = np.ones(record.shape, bool)
-        if some(flown):
-            self.sensors.sample(flown)
+        self.sensors.sample(flown)
         if self.replaces:
             seen = self.sensors.seen()
             values = {name: read_only(getattr(seen, name)) for name in _ESTIMATED}

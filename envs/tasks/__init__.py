@@ -2,9 +2,9 @@
 
 from ... import import_when_used
 
-__all__ = [
-    "Cable", "Crossing", "Dodge", "Elevation", "Escort", "Forest", "Formation", "Gates", "Hover",
-    "Landing", "PayloadHover", "Racing", "Recovery", "Tracking", "Warehouse", "Waypoints",
+__all__ = [  # noqa: RUF022  in the order in which their ids are listed
+    "Elevation", "Hover", "Waypoints", "Tracking", "Racing", "Landing", "Recovery", "PayloadHover",
+    "Formation", "Crossing", "Escort", "Cable", "Forest", "Dodge", "Warehouse", "Gates",
 ]  # fmt: skip
 
 _modules = {name: f".{name.lower()}" for name in __all__} | {"PayloadHover": ".payload_hover"}

@@ -48,8 +48,8 @@ def test_the_detector_learns_from_pictures(opengl: None, tmp_path: Path) -> None
     run(rotorgram("evaluate", "geometric", *flight), tmp_path)
     cameras = ("--cameras", "down@32x32", "down_segmentation@32x32")
     moved = ("--every", "9", "--aside", "1", "--tilt", "0.4", "--fast")
-    words = ("capture", "pad.mcap", *craft, "--scene", "airport", *cameras, *moved)
-    run(rotorgram(*words, "--out", "pad", "--jobs", "1"), tmp_path)
+    words = ("pad.mcap", *craft, "--scene", "airport", *cameras, *moved)
+    run_script("capture.py", tmp_path, *words, "--out", "pad", "--jobs", "1")
     words = ("pad", "--epochs", "2", "--out", "result.json")
     told = run_script("pad_detector.py", tmp_path, *words)
     assert json.loads(told) == json.loads((tmp_path / "result.json").read_text())
@@ -59,8 +59,8 @@ def test_the_detector_learns_from_pictures(opengl: None, tmp_path: Path) -> None
 
 def test_every_script_is_run() -> None:
     scripts = {path.name for path in EXAMPLES.glob("*.py")}
-    # Tests of the last three: test_own_task.py, test_swarm_tasks.py, test_vfh.py.
-    others = {"text_agent.py", "pad_detector.py", "landing.py", "orca.py", "vfh.py"}
+    # Tests of the last four: test_own_task.py, test_capture.py, test_swarm_tasks.py, test_vfh.py.
+    others = {"text_agent.py", "pad_detector.py", "landing.py", "capture.py", "orca.py", "vfh.py"}
     assert scripts == {*SHORT, *others}
     page = (EXAMPLES / "README.md").read_text()
     assert all(f"({script})" in page for script in scripts)

@@ -13,7 +13,7 @@ import gymnasium as gym
 import pytest
 from contracts import TABLES, rows_of
 from rotorgram.envs import ArraySpec, EnvConfig, Loop, Outcome, Task, register
-from rotorgram.envs.config import BackendConfig, SceneConfig, source_hash
+from rotorgram.envs.config import BackendConfig, SceneConfig, read_keywords, source_hash
 from rotorgram.envs.tasks import Hover
 from rotorgram.envs.tasks.racing import TRACKS
 from rotorgram.models import QUAD_XML
@@ -100,14 +100,14 @@ def test_flat_options_make_the_same_env() -> None:
     assert again == config
 
 
-def test_a_file_and_keywords_that_win(tmp_path: Path) -> None:
+def test_the_keywords_of_a_file(tmp_path: Path) -> None:
     (tmp_path / "own.xml").write_text("<mujoco/>")
     file = tmp_path / "drone.toml"
     file.write_text(
         f'env_id = "{HOVER}"\nvehicle = "own.xml"\nstart_tilt = 5\nhistory = 2\n'
         '[backend]\nname = "rigid"\n[effects]\ngusts = 2\n'
     )
-    config = EnvConfig.from_toml(file, history=4)
+    config = EnvConfig.from_keywords(**read_keywords(file) | {"history": 4})
     assert config.vehicle == (str(tmp_path / "own.xml"),)  # beside the file
     assert config.task["start_tilt"] == 5.0
     assert config.history == 4
@@ -115,9 +115,9 @@ def test_a_file_and_keywords_that_win(tmp_path: Path) -> None:
     assert config.effects.gusts == 2.0
     file.write_text("env_id = ")
     with pytest.raises(InputError, match=r"^config: expected a TOML file, got "):
-        EnvConfig.from_toml(file)
+        read_keywords(file)
     with pytest.raises(InputError, match=r"^config: cannot read .*nowhere.toml: "):
-        EnvConfig.from_toml(tmp_path / "nowhere.toml")
+        read_keywords(tmp_path / "nowhere.toml")
 
 
 @rows_of("a wrong field is one sentence", "keywords, sentence")
@@ -221,7 +221,7 @@ def test_a_config_of_the_library_holds_no_files() -> None:
 )
 def test_files_of_a_config_stay_in_their_folder(pair: Any) -> None:
     content = EnvConfig(env_id=HOVER).to_dict() | {"files": {"a.xml": [pair]}}
-    with pytest.raises(InputError, match=r"^files: expected a relative path and base64, got "):
+    with pytest.raises(InputError, match=r"^files: expected relative paths and contents in base64"):
         EnvConfig.from_dict(content)
 
 

@@ -187,7 +187,7 @@ def test_a_prediction_is_the_simulator_s(tmp_path: Path) -> None:
     constant = np.tile(speeds, (101, 1))
     flight = FlightLog(name="", period=0.005, speeds=constant, states=states)
     windows = Windows.cut([flight], 100, 200)
-    predicted = predict(vehicle, [numbers_of(vehicle)], windows)[0, 0]
+    predicted = predict(vehicle, [numbers_of(vehicle)], windows)[0, 0, 0]
     truth = np.concatenate([getattr(alone(world), name) for name in start])
     errors = np.abs(differences(predicted, truth))
     assert errors[:2].max() < 2e-4  # position and attitude
@@ -201,8 +201,8 @@ def test_free_fall_with_linear_drag_falls_as_the_closed_form() -> None:
     states[:, 3] = 1.0
     flight = FlightLog(name="", period=0.002, states=states, speeds=np.zeros((501, 4)))
     candidates = [numbers_of(vehicle) | {"drag.linear.z": drag} for drag in (0.5, 0.0)]
-    windows = Windows.cut([flight], 500, 600).repeated(2)
-    draggy, free = predict(vehicle, candidates, windows)[:, 0]
+    windows = Windows.cut([flight], 500, 600)
+    draggy, free = predict(vehicle, candidates, windows)[:, 0, 0]
     # m dv/dt = -m g - c v with m = 0.5, c = 0.5: v = -g (1 - e^-t), z = -g (t - 1 + e^-t).
     assert draggy[9] == pytest.approx(-9.81 * (1 - np.exp(-1)), abs=1e-5)
     assert draggy[2] == pytest.approx(-9.81 * np.exp(-1), abs=1e-5)

@@ -22,7 +22,7 @@ from rotorgram.envs.registry import env_spec
 from rotorgram.flights.filming import Film, FilmTrack, film, grid
 from rotorgram.flights.trajectories import Trajectory
 from rotorgram.models import InputError
-from rotorgram.rendering import Camera, Canvas, Stage
+from rotorgram.rendering import Camera, Canvas
 from rotorgram.rendering.film import check_film, write_film
 
 FAST = Film(width=WIDTH, height=HEIGHT, scene="plain", fast=True, overlay=False)
@@ -273,9 +273,9 @@ def test_lines_have_name_time_metric_and_end(
     written: list[list[tuple[str, str]]] = []
     draw = Canvas.draw
 
-    def noted(canvas: Canvas, camera: Camera, stage: Stage, lines: Any) -> np.ndarray:
+    def noted(canvas: Canvas, camera: Camera, lines: Any) -> np.ndarray:
         written.append(list(lines))
-        return draw(canvas, camera, stage, lines)
+        return draw(canvas, camera, lines)
 
     monkeypatch.setattr(Canvas, "draw", noted)
     first = trajectory(5.0, 4.0, 3.0, ending="terminated")

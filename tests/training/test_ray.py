@@ -15,15 +15,12 @@ import pytest
 from rotorgram.agents.checkpoints import load
 from rotorgram.envs.config import EnvConfig
 from rotorgram.flights import ray_cluster as module
-from rotorgram.flights.capture import capture
 from rotorgram.flights.executors import RunsFailed, WorkersConfig, open_executor, run_jobs
 from rotorgram.flights.folders import new_folder
-from rotorgram.flights.viewpoints import CaptureConfig
 from rotorgram.models.files import software_versions
 from rotorgram.training.results import Results
 from rotorgram.training.settings import Row, Study
 from rotorgram.training.study import run_study
-from rotorgram.udp.spawn import spawn_simulator
 
 # Ray listens beyond this machine. It reads these when it is imported.
 os.environ |= {
@@ -40,7 +37,6 @@ STUDY = Study(
     rows=(A2C, PID),
     seeds=1, snapshots=1, curve_episodes=1, episodes=1, wire=True, keep_steps=True,
 )  # fmt: skip
-PICTURES = CaptureConfig(cameras=("front@32x24", "front_depth@32x24"), every=1, aside=1.0)
 TIMES = ["seconds", "steps_per_second", "seconds_to_hold"]
 
 
@@ -109,24 +105,6 @@ def test_every_node_flies(address: str) -> None:
         run_jobs(executor, node, jobs, lambda _, value: found.append(value), nothing)
     assert sorted(job for job, _ in found) == [0, 1, 2, 3]
     assert len({where for _, where in found}) == 2
-
-
-def test_pictures_are_taken_on_a_cluster(opengl: None, tmp_path: Path, address: str) -> None:
-    journal = tmp_path / "flight.mcap"
-    with spawn_simulator(ENV, record=journal) as env:
-        env.reset(seed=1)
-        for _ in range(19):
-            env.step(env.action_space.sample())
-    found = []
-    for name, config in {
-        "here": WorkersConfig(jobs=1),
-        "there": WorkersConfig(runner="ray", address=address),
-    }.items():
-        folder = tmp_path / name
-        assert capture([journal], folder, PICTURES, config) == 20
-        found.append({p.relative_to(folder): p.read_bytes() for p in folder.rglob("*.[jpn]*")})
-    assert len(found[0]) > 40
-    assert found[0] == found[1]
 
 
 @pytest.mark.parametrize("package", ["numpy", "one-that-it-lacks"])

@@ -76,7 +76,7 @@ def test_the_baseline_lets_the_rates_decay_whatever_the_rotors_do() -> None:
     windows = Windows.cut(flights, 50, 10, (10, 25, 50))
     damping = replace(baseline, groups=real_flights.DAMPING)
     numbers = real_flights._fitted(damping, vehicle, numbers_of(vehicle), windows, flights)
-    predicted = predict(vehicle, [real_flights._flown(damping, numbers)], windows)
+    predicted = predict(vehicle, [real_flights._flown(damping, numbers)], windows)[0]
     for place, horizon in ((1, 25), (2, 50)):
         expected = windows.start[:, 10:] * np.exp(-horizon / 25)
         np.testing.assert_allclose(predicted[:, place, 10:], expected, atol=0.02)

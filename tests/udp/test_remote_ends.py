@@ -32,7 +32,6 @@ from rotorgram.udp import (
     Simulator,
 )
 from rotorgram.udp import __main__ as udp_main
-from rotorgram.udp import process as processes
 from rotorgram.udp.protocol import binary
 from rotorgram.udp.protocol.messages import Hello
 from rotorgram.udp.spawn import spawn_simulator, start_simulator
@@ -231,37 +230,6 @@ def test_the_simulator_program_ends_on_sigterm_and_tells_the_agent() -> None:
         assert process.wait(10) == 128 + signal.SIGTERM
         assert process.stdin is not None
         process.stdin.close()
-
-
-def test_a_process_that_began_early_flies_for_the_first_that_asks() -> None:
-    with processes.begun_early():
-        early, _ = processes._waiting[0]
-        with spawn_simulator(EnvConfig()) as remote:
-            assert not processes._waiting
-            assert remote.reset(seed=3)[0].tobytes() == gym.make(ENV_ID).reset(seed=3)[0].tobytes()
-        assert early.returncode == 0
-
-
-@pytest.mark.parametrize("words", ["--num-envs 7000000", "--bogus", "--env nobodys-v0"])
-def test_a_process_that_began_early_ends_with_a_command_that_fails(words: str) -> None:
-    script = (
-        "import os, sys\nfrom rotorgram.cli import main\nfrom rotorgram.udp import process\n"
-        "begun = []\nbegin = process.begin\n"
-        "process.begin = lambda *given: begun.append(begin(*given)) or begun[-1]\n"
-        f"try: status = main(['train', 'ppo', '--udp', *'{words}'.split()])\n"
-        "except SystemExit as error: status = error.code\n"
-        "print(status, begun[0].returncode, process._waiting)\n"
-    )
-    command = [sys.executable, "-X", "dev", "-W", "error", "-c", script]
-    around = {**os.environ, "MUJOCO_GL": "no such library"}  # which a simulator does not import
-    done = subprocess.run(command, capture_output=True, text=True, env=around)
-    assert done.stdout in ("1 -9 []\n", "2 -9 []\n")
-    assert done.stderr
-    assert "Warning" not in done.stderr
-    assert "Traceback" not in done.stderr
-    if words.startswith("--num-envs"):
-        assert done.stderr.startswith("rotorgram: env_steps: expected at least 7000000")
-        assert done.stderr.count("\n") == 1
 
 
 def test_sigterm_for_a_group_is_for_the_agent(tmp_path: Path) -> None:
