@@ -104,9 +104,9 @@ class EnvFlags(Command):
     """Number of the last observations that are observed side by side."""
     scene: str | None = None
     """Ground and obstacles: plain, airport, a TOML or MJCF file, or forest, warehouse, gates, maze,
-    aisles, traffic from a seed, as forest:3, from one of several for each episode, as forest:0-7,
-    or new in each, as forest:new,density=0.01,size=60x60. Films and views show it, and the airport
-    in place of bare ground. Default: the task's."""
+    aisles, hills, traffic from a seed, as forest:3, from one of several for each episode, as
+    forest:0-7, or new in each, as forest:new,density=0.01,size=60x60. Films and views show it, and
+    the airport in place of bare ground. Default: the task's."""
     cameras: Words = ()
     """Pictures that are observed: cameras of the vehicle, each NAME, NAME_KIND or
     NAME@WIDTHxHEIGHT."""

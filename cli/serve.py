@@ -24,9 +24,12 @@ class Serve(AgentFlags):
     def run(self) -> None:
         """Fly episode after episode."""
         from ..flights.trajectories import fly_episodes
+        from ..scenes import SceneConfig
         from ..udp import LinkError
         from ._env import fitted, in_unseen, load_pilot, policy_for, print_episode, remote_env
 
+        if self.options.get("scene"):
+            SceneConfig.parse(self.options["scene"]).embedded()  # before anyone waits
         checkpoint = load_pilot(self.policy)
         episode = 0
         with remote_env(in_unseen(fitted(self, checkpoint)), num_envs=None) as env:

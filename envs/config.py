@@ -203,7 +203,10 @@ class EnvConfig:
         values["effects"] = self.effects.to_options()
         own: Any = {"scene": None, "sensors": None}
         usual = replace(self, **own)  # with those of the task, which follow from its options
-        values["scene"] = None if self.scene == usual.scene else str(self.scene)
+        scene = self.scene
+        if scene.name == usual.scene.name:  # its options follow from the task's
+            scene = replace(scene, options={})
+        values["scene"] = None if self.scene == usual.scene else str(scene)
         values["task"] = {name: value for name, value in self.task.items() if name in KEYWORDS}
         values = {name: value for name, value in values.items() if value not in (None, (), {})}
         if self.sensors != usual.sensors:

@@ -22,7 +22,6 @@ _LARGEST = read_own_toml(__file__, "mjcf")
 """Largest attributes of elements. But for `size`, their product is a number of numbers."""
 _REPEATED = ("replicate", "composite", "flexcomp")
 _UNITS = "KMGTPE"  # each is 1024 times the one before
-_GROUNDS = (mjtGeom.mjGEOM_PLANE, mjtGeom.mjGEOM_HFIELD)
 
 
 def read_spec(path: Path) -> MjSpec:
@@ -51,11 +50,11 @@ def asset_files(spec: MjSpec, folder: Path) -> list[Path]:
 
 
 def has_ground(spec: MjSpec) -> bool:
-    return any(geom.type in _GROUNDS for geom in spec.worldbody.geoms)
+    return any(geom.type == mjtGeom.mjGEOM_PLANE for geom in spec.worldbody.geoms)
 
 
 def add_ground(spec: MjSpec) -> None:
-    """Add a plane at z = 0 to a spec without a plane or a height field."""
+    """Add a plane at z = 0 to a spec without a plane."""
     if has_ground(spec):
         return
     ground = MjSpec()  # of its own: the defaults of the vehicle's file are not the ground's

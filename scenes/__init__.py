@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 from .. import import_when_used
 from .config import SceneConfig, parse_scene
 from .generators import Draft
+from .options import SceneOptions
 from .registry import SCENES, SceneType, register, seeded_scenes
 
 if TYPE_CHECKING:
@@ -18,8 +19,8 @@ if TYPE_CHECKING:
     from .solids import Layouts, Solids
 
 __all__ = [
-    "SCENES", "Draft", "Layouts", "Rays", "SceneConfig", "SceneType", "Solids", "add_scene",
-    "build_scene", "parse_scene", "register", "seeded_scenes",
+    "SCENES", "Draft", "Layouts", "Rays", "SceneConfig", "SceneOptions", "SceneType", "Solids",
+    "add_scene", "build_scene", "parse_scene", "register", "seeded_scenes",
 ]  # fmt: skip
 
 SCENE_XML = Path(__file__).parent / "scene.xml"

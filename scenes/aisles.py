@@ -2,11 +2,12 @@
 
 from typing import TYPE_CHECKING
 
+from ..models.fields import immutable
+from .options import SceneOptions, Size
+
 if TYPE_CHECKING:
-    from .config import SceneConfig
     from .generators import Draft
 
-_SIZE = (12.0, 7.2)  # m
 PASSAGE = 1.4
 """Width of an aisle, m."""
 DEPTH = 3.0
@@ -17,24 +18,38 @@ along y."""
 _SHELF = 1.25  # m: half the height of racks
 
 
-def counts(scene: "SceneConfig") -> tuple[int, int]:
-    """Rows of racks, and aisles in each."""
-    wide, deep = scene.size or _SIZE
-    return int((wide - ROW + DEPTH) / ROW + 1e-6), int(deep / AISLE + 1e-6)
+@immutable
+class AislesOptions(SceneOptions):
+    """Options of the scene `aisles`."""
 
+    size: Size = (12.0, 7.2)
+    """Of the hall."""
 
-def most_of_aisles(scene: "SceneConfig") -> int:
-    """Upper bound of the number of parts of a layout."""
-    rows, count = counts(scene)
-    return 2 * rows * count + rows + 8
+    @property
+    def counts(self) -> tuple[int, int]:
+        """Rows of racks, and aisles in each."""
+        wide, deep = self.size
+        return int((wide - ROW + DEPTH) / ROW + 1e-6), int(deep / AISLE + 1e-6)
+
+    @property
+    def most(self) -> int:
+        """As `SceneOptions.most`."""
+        rows, count = self.counts
+        return 2 * rows * count + rows + 8
+
+    @property
+    def room(self) -> float:
+        """As `SceneOptions.room`."""
+        return 0.0
 
 
 def aisles(hall: "Draft") -> None:
     """Rows of racks across a hall. Each row has aisles through it, and goods at the far end of all
     but one of them.
     """
-    rows, count = counts(hall.scene)
-    wide, deep = hall.scene.size or _SIZE
+    options: AislesOptions = hall.options
+    rows, count = options.counts
+    wide, deep = options.size
     hall.add("ground/floor", "plane", (150, 150, 1), (0, 0, 0), "floor")
     for name, x, y in (("right", 0, -1), ("left", 0, 1), ("back", -1, 0), ("front", 1, 0)):
         half = (wide / 2 * abs(y) + 0.1, deep / 2 * abs(x) + 0.1, _SHELF)
@@ -46,7 +61,7 @@ def aisles(hall: "Draft") -> None:
 
 def _add_row(hall: "Draft", row: int, count: int, x: float) -> None:
     """Racks between aisles, goods in them, and the aisle that is left open."""
-    _, deep = hall.scene.size or _SIZE
+    _, deep = hall.options.size
     ways = [AISLE * (i - (count - 1) / 2) for i in range(count)]
     borders = [-deep / 2, *[y + side for y in ways for side in (-PASSAGE / 2, PASSAGE / 2)]]
     borders.append(deep / 2)

@@ -11,9 +11,8 @@ from ..models import QUAD_XML
 from ..models.mjcf import delete_obstacles, has_ground, read_spec
 from . import AIRPORT_XML, SCENE_XML
 from .config import SceneConfig, parse_scene
-from .kernels import KINDS
-from .looks import GEOM_TYPES, GROUP, SKY, add_parts
-from .obstacles import Obstacle, names_of, obstacles_of
+from .looks import SKY, add_geoms, add_parts
+from .obstacles import OWN, Obstacle, obstacles_of, parts_of_obstacles
 
 SCENE_PREFIX = "scene/"  # of all names that `add_scene` adds for the plain scene
 _NEAR = 0.25  # m: nearest distance that is drawn
@@ -63,15 +62,11 @@ def add_scene(spec: MjSpec, scene: str | SceneConfig = "plain") -> None:
 
 def _add_obstacles(spec: MjSpec, obstacles: Sequence[Obstacle]) -> None:
     """Add the obstacles of a file, which collide with nothing. Level ground is there already."""
-    for name, one in zip(names_of(obstacles), obstacles, strict=True):
+    geoms = add_geoms(spec, OWN, parts_of_obstacles(obstacles))
+    for geom, one in zip(geoms, obstacles, strict=True):
+        geom.rgba = (*one.color, 1.0)
         if one.is_ground:
-            continue
-        size = one.size or (0.0, 0.0, 1.0)
-        spec.worldbody.add_geom(
-            name=name, type=GEOM_TYPES[KINDS.index(one.kind)], size=(*size, 0.0, 0.0)[:3],
-            pos=one.position, quat=one.attitude, rgba=(*one.color, 1.0),
-            contype=0, conaffinity=0, group=GROUP, mass=0.0, density=0.0,
-        )  # fmt: skip
+            spec.delete(geom)
 
 
 def _add_plain(spec: MjSpec) -> None:

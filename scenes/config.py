@@ -3,11 +3,20 @@
 import re
 from collections.abc import Mapping
 from dataclasses import field, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Any, Literal, NoReturn, Self
 
 from ..models.errors import InputError, shortened
-from ..models.fields import Limits, check_fields, immutable, read_table
+from ..models.fields import (
+    Limits,
+    Rule,
+    check_fields,
+    immutable,
+    read_table,
+    rules_of,
+    set_fields,
+)
 from .registry import MAX_SOLIDS, SCENES, SceneType, seeded_scenes
 
 MAX_SEEDS = 64
@@ -16,21 +25,13 @@ NEW_SEEDS = 1 << 28
 """How many seeds there are for new layouts, and as many for unseen ones."""
 FILES = (".toml", ".xml")
 """Endings of files that describe a scene."""
-FOREST_SIZE = (120.0, 120.0)  # m
-GATES_SIZE = 50.0  # m
-OPENING = 5.0
-"""Width of a gate inside, in a scene of `GATES_SIZE`, m: the paper's craft is 2.8 m wide."""
-TREE_DENSITY = 0.0076  # 1/m²
-MAX_TREES = 2000
-_LEAST_SIDE = 10.0  # m: of a forest or a maze
-_LEAST_HALF = 12.0  # m: half of a forest or a maze at least, around a middle that is clear
 
 
 @immutable
 class SceneConfig:
     """Ground and obstacles around the drones.
 
-    As a text: NAME, then `:SEED`, `:FIRST-LAST`, `:new` or `:unseen`, then further fields, as in
+    As a text: NAME, then `:SEED`, `:FIRST-LAST`, `:new` or `:unseen`, then options, as in
     `forest:new,density=0.1,size=34x16,clear=ends`. Or the path of a TOML or MJCF file.
     """
 
@@ -43,14 +44,8 @@ class SceneConfig:
     layouts: Literal["given", "new", "unseen"] = "given"
     """`given`: those of `seeds`. `new`: each episode of each world draws a layout of its own.
     `unseen`: the same, of layouts that `new` never draws, for evaluation."""
-    density: Annotated[float | None, Limits(1e-4, 0.5, "1/m²")] = None
-    """Trees per square metre of a forest."""
-    size: Annotated[tuple[float, float] | None, Limits(4.0, 400.0, "m", count=2)] = None
-    """Along x and y, m: of a forest, of a maze, of aisles, or of a square of gates, which grow with
-    it: those of 50 m are 5 m wide."""
-    clear: Literal["middle", "ends"] = "middle"
-    """Where a forest or a maze leaves room for craft: 8 m about the z axis, or 2 m about the
-    middles of both of its ends in x."""
+    options: Mapping[str, Any] = field(default_factory=dict, hash=False)
+    """Options of the scene by name. Those that are missing have the defaults of its `SceneType`."""
     content: str = field(default="", repr=False)
     """Obstacles of the file, as `obstacles` has them; set by `EnvConfig.resolve`, which needs the
     file no more."""
@@ -70,50 +65,21 @@ class SceneConfig:
         wrong = has_layouts and not self.is_seeded
         if wrong or both or len(seeds) > MAX_SEEDS:
             _refuse(f"{self.name} with seeds {shortened(seeds)} and {self.layouts} layouts")
-        self._check_options()
-        if self.name == "forest" and self.trees > MAX_TREES:
-            raise InputError(f"scene: expected at most {MAX_TREES} trees, got {self.trees}")
-        most = self.type.most(self)
-        if most > MAX_SOLIDS:
-            raise InputError(f"scene: expected at most {MAX_SOLIDS} parts, got {most} of {self}")
+        rules = rules_of(self.type.options)
+        if self.options and not rules:
+            got = ", ".join(self.options)
+            raise InputError(f"scene: expected no options with {self.name}, got {got}")
+        values = self.values
+        given = {name: getattr(values, name) for name in rules if name in self.options}
+        set_fields(self, options=given)
+        if values.most > MAX_SOLIDS:
+            expected = f"at most {MAX_SOLIDS} parts"
+            raise InputError(f"scene: expected {expected}, got {values.most} of {self}")
 
-    def _check_options(self) -> None:
-        """Raise `InputError` for a field that the scene does not have, or no room for obstacles."""
-        more = {"density": self.density, "size": self.size, "clear": self.clear != "middle"}
-        for option, value in more.items():
-            if value and option not in self.type.options:
-                able = [name for name, kind in SCENES.items() if option in kind.options]
-                expected = f"{option} with the scene {' or '.join(able)} alone"
-                raise InputError(f"scene: expected {expected}, got {self.name}")
-        if self.name == "gates" and len(set(self.size or ())) > 1:
-            raise InputError(f"scene: expected a square of gates, got {self}")
-        if not (self.size and "clear" in self.type.options):
-            return
-        narrowest, widest = sorted(self.size)
-        if narrowest < _LEAST_SIDE:
-            expected = f"sides of at least {_LEAST_SIDE:g} m"
-            raise InputError(f"scene: expected {expected}, got {narrowest:g} m")
-        if self.clear == "middle" and widest < 2 * _LEAST_HALF:
-            expected = f"a size of {2 * _LEAST_HALF:g} m or more, or clear=ends"
-            raise InputError(f"scene: expected {expected}, got a size of {widest:g} m")
-
-    @property
-    def trees(self) -> int:
-        """How many a forest has."""
-        wide, deep = self.size or FOREST_SIZE
-        return round(wide * deep * (self.density or TREE_DENSITY))
-
-    @property
-    def scale(self) -> float:
-        """How large gates are: 1 in a scene of `GATES_SIZE`."""
-        return (self.size or (GATES_SIZE,))[0] / GATES_SIZE
-
-    @property
-    def room(self) -> float:
-        """Half the width of the space about the z axis that is clear, m."""
-        if self.clear == "ends":
-            return 0.0
-        return self.type.room * (self.scale if self.name == "gates" else 1.0)
+    @cached_property
+    def values(self) -> Any:
+        """All options, as those of its `SceneType`."""
+        return read_table(self.type.options, self.options, "scene")
 
     def __str__(self) -> str:
         """The text that `parse` reads."""
@@ -123,11 +89,7 @@ class SceneConfig:
         elif self.seeds:
             first, last = self.seeds[0], self.seeds[-1]
             text += f":{first}" if first == last else f":{first}-{last}"
-        if self.density:
-            text += f",density={_digits(self.density)}"
-        if self.size:
-            text += f",size={'x'.join(map(_digits, self.size))}"
-        return text + (f",clear={self.clear}" if self.clear != "middle" else "")
+        return text + "".join(f",{name}={_text_of(x)}" for name, x in self.options.items())
 
     @classmethod
     def parse(cls, scene: Any) -> Self:
@@ -141,20 +103,19 @@ class SceneConfig:
         text, *pairs = scene.replace(" ", "").split(",") if isinstance(scene, str) else ("",)
         pattern = r"(\w+)(?::(?:(new|unseen)|([0-9]{1,9})(?:-([0-9]{1,9}))?))?"
         found = re.fullmatch(pattern, text)
-        fields = [re.fullmatch(r"(density|size|clear)=([\w.+-]+)", pair) for pair in pairs]
-        once = len({pair.partition("=")[0] for pair in pairs}) == len(pairs)
-        if not found or not all(fields) or not once:
+        named = [re.fullmatch(r"(\w+)=([\w.+-]+)", pair) for pair in pairs]
+        options = {match[1]: match[2] for match in named if match}
+        if not found or len(options) < len(pairs):
             _refuse(shortened(scene))
         name, layouts, first, last = found.groups()
         seeds = range(int(first), int(last or first) + 1) if first else range(0)
         if len(seeds) > MAX_SEEDS or (first and not seeds):
             _refuse(shortened(scene))
-        values: dict[str, Any] = {match[1]: match[2] for match in fields if match}
-        for number, mark in (("density", ""), ("size", "x")):
-            if number in values:
-                values[number] = _numbers(values[number], mark)
-        values |= {"name": name, "layouts": layouts or "given", "seeds": tuple(seeds)}
-        return cls(**values)
+        rules = rules_of(SCENES[name].options) if name in SCENES else {}
+        values = {key: _value_of(text, rules.get(key)) for key, text in options.items()}
+        layouts = layouts or "given"
+        table = {"name": name, "seeds": tuple(seeds), "layouts": layouts, "options": values}
+        return read_table(cls, table, "scene")
 
     @property
     def given_scenes(self) -> "tuple[SceneConfig, ...]":
@@ -168,12 +129,15 @@ class SceneConfig:
         return replace(self, seeds=(seed,), layouts="given") if self.is_seeded else self
 
     def filled(self, usual: "SceneConfig") -> "SceneConfig":
-        """The same; without options of its own it has those of another scene of its name."""
-        if self.name != usual.name or self != replace(
-            self, density=None, size=None, clear="middle"
-        ):
+        """The same with the options of a task's own scene, if it is that. Raises `InputError` for
+        options that contradict the task's.
+        """
+        if self.name != usual.name or not usual.options:
             return self
-        return replace(self, density=usual.density, size=usual.size, clear=usual.clear)
+        for name, value in self.options.items():
+            if _rounded(value) != _rounded(usual.options.get(name)):
+                raise InputError(f"scene: expected {usual}, as the task's options say, got {self}")
+        return replace(self, options=usual.options)
 
     def unseen(self) -> "SceneConfig":
         """The same for tests: unseen layouts in place of new ones."""
@@ -228,17 +192,29 @@ def parse_scene(text: Any) -> SceneConfig:
     return scene
 
 
-def _digits(number: float) -> str:
-    """All digits of a number."""
-    return repr(number).removesuffix(".0")
+def _text_of(value: object) -> str:
+    """An option as `parse` reads it, a number with all of its digits."""
+    if isinstance(value, tuple):
+        return "x".join(map(_text_of, value))
+    return repr(value).removesuffix(".0") if isinstance(value, float) else str(value)
 
 
-def _numbers(text: str, mark: str) -> Any:
-    """A number of a text, or several with a mark between; the text where it is none."""
+def _rounded(value: object) -> object:
+    """An option without the last digits of its numbers."""
+    if isinstance(value, tuple):
+        return tuple(map(_rounded, value))
+    return round(value, 6) if isinstance(value, float) else value
+
+
+def _value_of(text: str, rule: Rule | None) -> object:
+    """The reverse of `_text_of`; the text itself where it is no number."""
+    if not isinstance(rule, Limits):
+        return text
     try:
-        return tuple(map(float, text.split(mark))) if mark else float(text)
+        numbers = tuple(map(float, text.split("x")))
     except ValueError:
         return text
+    return numbers[0] if rule.count == len(numbers) == 1 else numbers
 
 
 def _refuse(got: str) -> NoReturn:

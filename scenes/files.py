@@ -1,6 +1,7 @@
 """Users' files that describe a scene: TOML and MJCF. Imports MuJoCo."""
 
 import base64
+import struct
 from pathlib import Path
 
 import mujoco
@@ -12,12 +13,13 @@ from ..models.errors import InputError, one_line
 from ..models.files import read_toml
 from ..models.mjcf import check_sizes, switch_off_log_file
 from .config import SceneConfig
+from .fields import check_points
 from .geoms import geoms_of
 from .kernels import KINDS
 from .obstacles import SIZES, Obstacle, obstacles_in, to_content
 from .solids import Solids
 
-_HELD = ("sphere", "capsule", "cylinder", "box", "plane", "ellipsoid")
+_HELD = (*KINDS, "ellipsoid")
 _GREY = (0.5, 0.5, 0.5, 1.0)  # of a geom without a colour of its own
 
 
@@ -26,10 +28,10 @@ def read_scene_file(path: Path) -> str:
 
     Raises `InputError`, which names the file and what of it is wrong.
     """
-    if not path.is_file():
-        got = "another thing" if path.exists() else "none"
-        raise InputError(f"scene: expected a file {path}, got {got}")
     try:
+        if not path.is_file():
+            got = "another thing" if path.exists() else "none"
+            raise InputError(f"expected a file, got {got}")
         if path.suffix.lower() == ".toml":
             return to_content(obstacles_in(read_toml(path, "file")))
         return to_content(_of_mjcf(path))
@@ -58,6 +60,8 @@ def _of_mjcf(path: Path) -> tuple[Obstacle, ...]:
     switch_off_log_file()
     try:
         spec = MjSpec.from_file(str(path))
+        for field in spec.hfields:
+            _check_picture(path.parent / spec.meshdir / field.file)
         _keep_solids(spec)
         model = spec.compile()
     except InputError:
@@ -76,12 +80,23 @@ def _of_mjcf(path: Path) -> tuple[Obstacle, ...]:
             kind=KINDS[kind],
             size=tuple(rows["geom_size"][i, : SIZES[KINDS[kind]]].tolist()),
             position=tuple(solids.centers[i].tolist()),
+            heights=() if solids.grids[i] is None else solids.grids[i].round(5),
             quaternion=tuple(rows["geom_quat"][i].tolist()),
             color=tuple(model.geom_rgba[i, :3].astype(float).round(4).tolist()),
             label="" if labels[i] == "main" else labels[i],
         )
         for i, kind in enumerate(solids.kinds.tolist())
     )
+
+
+def _check_picture(path: Path) -> None:
+    """Refuse a PNG file of too many heights, before MuJoCo reads it. Raises `InputError`."""
+    if path.is_file():
+        with path.open("rb") as file:
+            header = file.read(24)
+        if header[12:16] == b"IHDR":
+            columns, rows = struct.unpack(">II", header[16:])
+            check_points(rows, columns, path.name)
 
 
 def _keep_solids(spec: MjSpec) -> None:
@@ -91,6 +106,9 @@ def _keep_solids(spec: MjSpec) -> None:
     """
     if spec.flexes:
         raise InputError(f"expected geoms, got the flex {spec.flexes[0].name}")
+    for part in (*spec.pairs, *spec.tendons, *spec.sensors, *spec.actuators, *spec.equalities):
+        spec.delete(part)
+    spec.compiler.boundmass = spec.compiler.boundinertia = 1.0  # of bodies that lose their geoms
     for geom in list(spec.geoms):
         if not geom.contype | geom.conaffinity:
             spec.delete(geom)
@@ -103,5 +121,5 @@ def _keep_solids(spec: MjSpec) -> None:
         if material is not None and np.allclose(geom.rgba, _GREY):
             geom.rgba = material.rgba
         geom.material = ""
-    for part in (*spec.materials, *spec.textures, *spec.meshes, *spec.hfields, *spec.skins):
+    for part in (*spec.materials, *spec.textures, *spec.meshes, *spec.skins):
         spec.delete(part)

@@ -6,25 +6,29 @@ World frame: z up, m. A generator draws what stands in a scene from one stream, 
 import math
 from collections.abc import Callable, Sequence
 from functools import lru_cache
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike as Vector
 from numpy.typing import NDArray
 
 from ..models.errors import InputError
+from ..models.fields import Limits, immutable
 from ..models.files import read_own_toml
-from .aisles import aisles, most_of_aisles
-from .config import FOREST_SIZE, OPENING, SceneConfig
+from ..models.matrices import settled
+from .aisles import AislesOptions, aisles
+from .config import SceneConfig
+from .fields import HillsOptions, centered, hills
 from .kernels import KINDS
-from .maze import maze, most_walls
+from .maze import MazeOptions, maze
 from .motion import REST
-from .registry import CLEARANCE, SceneType, register
-from .traffic import most_of_traffic, traffic
+from .options import CLEARANCE, Clear, SceneOptions, Size
+from .registry import SceneType, register
+from .traffic import TrafficOptions, traffic
 
 Array = NDArray[np.float64]
 
-SPHERE, CAPSULE, CYLINDER, BOX, _ = range(len(KINDS))
+SPHERE, CAPSULE, CYLINDER, BOX, *_ = range(len(KINDS))
 
 _MATERIALS = read_own_toml(__file__, "materials")
 """By scene and name."""
@@ -42,13 +46,16 @@ _ROCK_DENSITY = 1 / 360
 _ROCK_REACH = 1.2  # m
 _ENDS = 2.0  # m: radius of the clear spaces at the ends of a forest
 _GATES = 8
-
+OPENING = 5.0
+"""Width of a gate inside, in a scene of `GATES_SIZE`, m: the paper's craft is 2.8 m wide."""
+GATES_SIZE = 50.0  # m
+_MOST_PARTS = 1 + int(_COUNTS.max())  # of a tree
 
 Names = Callable[[], Sequence[str]]
 
 
 class Parts(NamedTuple):
-    """Primitives, as geoms of MuJoCo, turned about z."""
+    """Primitives, as geoms of MuJoCo."""
 
     names: Names
     kinds: NDArray[np.int8]
@@ -58,10 +65,12 @@ class Parts(NamedTuple):
     positions: Array
     """Of their centers, m, shape (n, 3)."""
     materials: Names
-    headings: Array
-    """rad, shape (n,)."""
+    axes: Array
+    """As columns, shape (n, 3, 3)."""
     motions: Array
     """As of `motion`, shape (n, 11)."""
+    grids: NDArray[np.object_]
+    """As of `Solids`, shape (n,)."""
 
 
 class Draft:
@@ -69,6 +78,7 @@ class Draft:
 
     def __init__(self, scene: SceneConfig, seed: int) -> None:
         self.scene = scene
+        self.options = scene.values
         self.parts: list[Parts] = []
         self.openings: list[tuple[float, ...]] = []
         """In the order in which they are passed: center, x and y of the direction, half the width,
@@ -122,19 +132,58 @@ class Draft:
         """Add parts; one heading may be that of all, and so may one motion."""
         rows = np.array(positions, float)
         turns = np.full(len(rows), headings, float)
+        axes = np.zeros((len(rows), 3, 3))
+        axes[:, 0, 0] = axes[:, 1, 1] = settled(np.cos(turns))
+        axes[:, 1, 0] = settled(np.sin(turns))
+        axes[:, 0, 1] = -axes[:, 1, 0]
+        axes[:, 2, 2] = 1.0
         own = np.array(kinds, np.int8), np.array(sizes, float)
         motions = np.zeros((len(rows), len(REST)))
         motions[:] = motion
-        self.parts.append(Parts(names, *own, rows, materials, turns, motions))
+        grids = np.full(len(rows), None)
+        self.parts.append(Parts(names, *own, rows, materials, axes, motions, grids))
+
+    def add_heights(
+        self, name: str, half: Vector, heights: Array, depth: float, material: str
+    ) -> None:
+        """Add a height field about the z axis: half its width along x and along y, m; heights above
+        z = 0, m, (rows, columns), and how deep it is below it, m.
+        """
+        center, grid = centered(heights, depth)
+        size = np.append(half, depth + center)
+        self.add(name, "hfield", size, (0, 0, center), material)
+        self.parts[-1].grids[0] = grid
+
+
+@immutable
+class ForestOptions(Clear):
+    """Options of the scene `forest`."""
+
+    density: Annotated[float, Limits(1e-4, 0.5, "1/m²")] = 0.0076
+    """Trees per square metre."""
+    size: Size = (120.0, 120.0)
+
+    @property
+    def counts(self) -> tuple[int, int, int]:
+        """Trees, shrubs and rocks."""
+        wide, deep = self.size
+        densities = (self.density, _SHRUB_DENSITY, _ROCK_DENSITY)
+        trees, shrubs, rocks = (round(wide * deep * density) for density in densities)
+        return trees, shrubs, rocks
+
+    @property
+    def most(self) -> int:
+        """As `SceneOptions.most`."""
+        trees, shrubs, rocks = self.counts
+        return _MOST_PARTS * trees + shrubs + rocks + 1
 
 
 def forest(wood: Draft) -> None:
     """A wood: trees, shrubs and rocks. Its crowns are over 4 m high."""
-    wide, deep = wood.scene.size or FOREST_SIZE
+    options: ForestOptions = wood.options
+    wide, deep = options.size
     area = wide * deep
-    trees = wood.scene.trees
-    shrubs = round(area * _SHRUB_DENSITY)
-    rocks = round(area * _ROCK_DENSITY)
+    trees, shrubs, rocks = options.counts
     green = trees + shrubs
     edge = max(150.0, wide, deep)
     wood.add("ground/floor", "plane", (edge, edge, 1), (0, 0, 0), "ground")
@@ -148,7 +197,7 @@ def forest(wood: Draft) -> None:
     aside = (0.6 * drawn[:trees, 4:] - 0.3) * spread[:, None]
     radii = 0.4 + 0.8 * drawn[trees:green, 0]
     sides = 0.3 + 0.7 * drawn[green:, :3]
-    narrow = trunk if wood.scene.clear == "ends" else 1.1 * spread
+    narrow = trunk if wood.options.clear == "ends" else 1.1 * spread
     places = _places(wood, np.concatenate((narrow, radii, np.full(rocks, _ROCK_REACH))))
 
     def add(what: str, kind: int, sizes: Any, heights: Array, first: int, **more: Any) -> None:
@@ -192,14 +241,14 @@ def _add_crowns(
 
 def _places(wood: Draft, reach: Array) -> Array:
     """Places in the wood, (n, 2), whose circles of radius `reach` touch no clear space."""
-    half = np.array(wood.scene.size or FOREST_SIZE) / 2
+    half = np.array(wood.options.size) / 2
     places = np.empty((len(reach), 2))
     left = np.arange(len(reach))
     while left.size:
         places[left] = drawn = half * (2.0 * wood.rng.random((left.size, 2)) - 1.0)
         x, y = abs(drawn.T)
         room = CLEARANCE - np.maximum(x, y)
-        if wood.scene.clear == "ends":
+        if wood.options.clear == "ends":
             x = x - (half[0] - _ENDS)
             room = _ENDS - np.sqrt(x * x + y * y)
         left = left[room > -reach[left]]
@@ -243,6 +292,29 @@ def _add_goods(hall: Draft, number: int) -> None:
     hall.add(f"pallet_{number}/box", "box", half, (x, y, 0.16 + half[2]), tint)
 
 
+@immutable
+class GatesOptions(SceneOptions):
+    """Options of the scene `gates`."""
+
+    size: Size = (GATES_SIZE, GATES_SIZE)
+    """Of a square of gates, which grow with it: those of 50 m are 5 m wide."""
+
+    def check(self) -> None:
+        """As `SceneOptions.check`."""
+        if len(set(self.size)) > 1:
+            raise InputError(f"scene: expected a square of gates, got {self.size}")
+
+    @property
+    def scale(self) -> float:
+        """1 of 50 m."""
+        return self.size[0] / GATES_SIZE
+
+    @property
+    def room(self) -> float:
+        """As `SceneOptions.room`."""
+        return CLEARANCE * self.scale
+
+
 def gates(track: Draft) -> None:
     """A ring of 8 gates, 5 m wide inside, with barriers, cones and stands around it.
 
@@ -269,7 +341,7 @@ def gates(track: Draft) -> None:
             size = (0.75, 9.0, height)
             track.add(f"stand_{i}/row_{row}", "box", size, position, "stand", angle)
     ground, *others = track.parts
-    scale = track.scene.scale
+    scale = track.options.scale
     scaled = [
         one._replace(sizes=scale * one.sizes, positions=scale * one.positions) for one in others
     ]
@@ -286,7 +358,7 @@ def _add_gate(track: Draft, number: int) -> None:
     tint = track.choose("paint")
     x = radius * math.cos(angle)
     y = radius * math.sin(angle)
-    scale = track.scene.scale
+    scale = track.options.scale
     center = (scale * x, scale * y, scale * height)
     track.openings.append((*center, math.cos(heading), math.sin(heading), scale * half))
     foot = (height - half - 2 * bar) / 2
@@ -299,12 +371,6 @@ def _add_gate(track: Draft, number: int) -> None:
     for part, sign in (("top", 1), ("bottom", -1)):
         position = (x, y, height + sign * (half + bar))
         track.add(f"gate_{number}/frame_{part}", "box", (0.15, half, bar), position, tint, heading)
-
-
-def _most_of_forest(scene: SceneConfig) -> int:
-    """Upper bound of the number of parts of a forest."""
-    wide, deep = scene.size or FOREST_SIZE
-    return 4 * scene.trees + round(wide * deep * (_SHRUB_DENSITY + _ROCK_DENSITY)) + 8
 
 
 def parts_of(scene: SceneConfig, seed: int) -> list[Parts]:
@@ -327,41 +393,21 @@ def _drafted(scene: SceneConfig, seed: int) -> Draft:
     if draw is None:
         return draft
     draw(draft)
-    most = scene.type.most(scene)
+    most = scene.values.most
     count = sum(len(one.kinds) for one in draft.parts)
     if count > most:
         raise InputError(f"scene: expected at most {most} parts of {scene.name}, got {count}")
     return draft
 
 
-register(
-    "forest",
-    SceneType(
-        draw=forest,
-        materials=_MATERIALS["forest"],
-        most=_most_of_forest,
-        options=("density", "size", "clear"),
-    ),
-)
-register("warehouse", SceneType(draw=warehouse, materials=_MATERIALS["warehouse"]))
-register("gates", SceneType(draw=gates, materials=_MATERIALS["gates"], options=("size",)))
-register(
-    "aisles",
-    SceneType(
-        draw=aisles,
-        materials=_MATERIALS["aisles"],
-        most=most_of_aisles,
-        room=0.0,
-        options=("size",),
-    ),
-)
-register(
-    "maze",
-    SceneType(draw=maze, materials=_MATERIALS["maze"], most=most_walls, options=("size", "clear")),
-)
-register(
-    "traffic",
-    SceneType(
-        draw=traffic, materials=_MATERIALS["traffic"], most=most_of_traffic, room=0.0, moves=True
-    ),
-)
+def _register(name: str, draw: Callable[[Draft], None], **more: Any) -> None:
+    register(name, SceneType(draw=draw, materials=_MATERIALS[name], **more))
+
+
+_register("forest", forest, options=ForestOptions)
+_register("warehouse", warehouse)
+_register("gates", gates, options=GatesOptions)
+_register("aisles", aisles, options=AislesOptions)
+_register("maze", maze, options=MazeOptions)
+_register("hills", hills, options=HillsOptions)
+_register("traffic", traffic, options=TrafficOptions, moves=True)

@@ -2,16 +2,18 @@
 
 import mujoco
 import numpy as np
-from mujoco import MjSpec, mjtGeom
+from mujoco import MjModel, MjSpec, mjtGeom
+from numpy.typing import NDArray
 
 from ..models.mjcf import add_ground
 from . import kernels
-from .looks import GEOM_TYPES
+from .fields import least_of
+from .looks import GEOM_TYPES, shape_of
 from .solids import Solids
 
 NAME = "rotorgram/solid"
 """Of a geom, before its number."""
-_SPHERE, _CAPSULE, _CYLINDER, _BOX, _PLANE = range(len(kernels.KINDS))
+_SPHERE, _CAPSULE, _CYLINDER, _BOX, _PLANE, HFIELD = range(len(kernels.KINDS))
 # MuJoCo's compiler notes which geoms have the axes of their body, and turns these no more.
 _TURNED = (0.8, 0.0, 0.0, 0.6)
 _AWAY = (0.0, 0.0, -1e4)  # m: where geoms lie that stand for nothing
@@ -22,13 +24,29 @@ def add_solids(spec: MjSpec, solids: Solids, count: int) -> None:
     add_ground(spec)
     own = MjSpec()  # its defaults are not the spec's
     fields = geoms_of(solids, count)
-    for number in range(count):
+    grids = [*solids.grids, *[None] * (count - len(solids))]
+    for number, grid in enumerate(grids):
+        shape = shape_of(own, f"{number}", fields["geom_size"][number], grid)
         own.worldbody.add_geom(
             name=f"{number}", type=fields["geom_type"][number], pos=fields["geom_pos"][number],
-            quat=fields["geom_quat"][number], size=fields["geom_size"][number],
+            quat=fields["geom_quat"][number], **shape,
         )  # fmt: skip
     own.visual, own.stat = spec.visual, spec.stat  # MuJoCo warns if they differ
     spec.attach(own, prefix=NAME, frame=spec.worldbody.add_frame())
+
+
+def add_fields(spec: MjSpec, number: int, solids: Solids) -> None:
+    """Add the height fields of a layout to a spec."""
+    for row in np.flatnonzero(solids.kinds == HFIELD).tolist():
+        shape_of(spec, f"{NAME}{number}_{row}", solids.halves[row], solids.grids[row])
+
+
+def fields_of(model: MjModel, number: int, solids: Solids) -> NDArray[np.int64]:
+    """Which field of a model with `add_fields` each solid of a layout is, or -1, (n,)."""
+    which = np.full(len(solids), -1)
+    for row in np.flatnonzero(solids.kinds == HFIELD).tolist():
+        which[row] = model.hfield(f"{NAME}{number}_{row}").id
+    return which
 
 
 def geoms_of(solids: Solids, count: int) -> dict[str, np.ndarray]:
@@ -37,14 +55,15 @@ def geoms_of(solids: Solids, count: int) -> dict[str, np.ndarray]:
     kinds = solids.kinds
     a, b, c = solids.halves.T
     is_plane = kinds == _PLANE
-    is_flat = (kinds == _BOX) | is_plane
+    is_flat = (kinds == _BOX) | (kinds == HFIELD) | is_plane
     type_ = np.full(count, mjtGeom.mjGEOM_SPHERE.value)
     position = np.full((count, 3), _AWAY)
     quaternion = np.tile(_TURNED, (count, 1))
     size = np.zeros((count, 3))
     size[:, 0] = 0.1
     type_[:given] = np.array([one.value for one in GEOM_TYPES])[kinds]
-    position[:given] = solids.centers
+    lows = np.array([least_of(grid) for grid in solids.grids])
+    position[:given] = solids.centers + lows[:, None] * solids.axes[:, :, 2]
     for row, axes in zip(quaternion, solids.axes, strict=False):
         mujoco.mju_mat2Quat(row, axes.ravel())
     second = np.where(kinds == _CAPSULE, c - a, np.where(kinds == _CYLINDER, c, b))
@@ -53,12 +72,14 @@ def geoms_of(solids: Solids, count: int) -> dict[str, np.ndarray]:
     size[:given, 2] = np.where(is_flat, np.where(is_plane, 1.0, c), 0.0)
     half = np.full((count, 3), 0.1)
     half[:given] = solids.halves
-    square = half * half
-    reach = np.sqrt(square.sum(axis=1))
+    furthest = half.copy()
+    furthest[:given, 2] += abs(lows)
+    reach = np.sqrt((furthest * furthest).sum(axis=1))
     reach[:given] = np.where(kinds == _CYLINDER, np.sqrt(a * a + c * c), reach[:given])
     reach[:given] = np.where(kinds <= _CAPSULE, c, reach[:given])
     reach[:given][is_plane] = 0.0
     box = np.concatenate((np.zeros((count, 3)), half), axis=1)
+    box[:given, 2] = -lows
     return {
         "geom_type": type_, "geom_pos": position, "geom_quat": quaternion, "geom_size": size,
         "geom_rbound": reach, "geom_aabb": box,

@@ -1,12 +1,14 @@
 """Rays and distances to primitives, float32: formulas that NumPy runs, and Numba compiles.
 
-A formula is array code of `_least`, `_most`, `_pick`, `_root` and operators. NumPy runs it on
-arrays; Numba on numbers, in loops that become vectors. The bits are the same: so are the
+A formula is array code of operators and of `_least`, `_most`, `_pick` and their like. NumPy runs it
+on arrays; Numba on numbers, in loops that become vectors. The bits are the same: so are the
 operations and their order, and none is fused with another. What compiled code leaves out, since it
 is too far away or out of sight, no ray could meet by `_MARGIN`.
 
 A table, shape (16, P), has of each primitive its center, its three axes, and half the sides of the
-box about it, m; the last row is the radius by which that box is rounded.
+box about it, m; the last row is the radius by which that box is rounded. Of a height field it is
+the number of columns to the first one with its heights, of the kind `REST`: how many it has along
+x and along y, the cosine of its steepest slope, and its heights above its center, m, row by row.
 """
 
 from collections.abc import Callable
@@ -16,17 +18,25 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-KINDS = ("sphere", "capsule", "cylinder", "box", "plane")
+KINDS = ("sphere", "capsule", "cylinder", "box", "plane", "hfield")
 """Capsule and cylinder stand along their third axis. That of a plane is its normal: what lies
-below is solid."""
+below is solid. A height field has two triangles in each cell of its grid, as MuJoCo's."""
+REST = len(KINDS)
+"""Kind of the columns of a table that are no primitive."""
+HEADER = 3
+"""Numbers before the heights of a height field."""
 ROWS = 16
 LANES = 16
 """Rays of a packet."""
 
-_SPHERE, _CAPSULE, _CYLINDER, _BOX, _PLANE = range(len(KINDS))
+_SPHERE, _CAPSULE, _CYLINDER, _BOX, _PLANE, _HFIELD = range(len(KINDS))
 _CENTER, _U, _V, _AXIS, _SIZE, _ROUNDING = 0, 3, 6, 9, 12, 15
 _ZERO = np.float32(0.0)
 _ONE = np.float32(1.0)
+_TWO = np.float32(2.0)
+_TRUE = np.True_
+_HEADER = np.float32(HEADER)
+_AROUND = (-_ONE, _ZERO, _ONE)
 _TINY = np.float32(1e-12)
 _NUDGE = np.float32(1e-9)
 _BIG = np.float32(1e30)
@@ -59,6 +69,18 @@ def _pick(flag: Array, yes: Array, no: Array) -> Array:
 
 def _root(x: Array) -> Array:
     return np.sqrt(x)
+
+
+def _down(x: Array) -> Array:
+    return np.floor(x)
+
+
+def _index(x: Array) -> Array:
+    return np.asarray(x).astype(np.int64)
+
+
+def _all(flag: Array) -> Array:
+    return np.all(flag)
 
 
 def _dot(a: Vector, b: Vector) -> Array:
@@ -153,8 +175,98 @@ def _plane(ray: Vector, solid: Array) -> Array:
     return met, met, down < -_TINY
 
 
-_MEETINGS = (_sphere, _capsule, _cylinder, _box, _plane)
-"""By `KINDS`."""
+# ---- height fields
+
+
+def _number(table: Array, j: Array, place: Array) -> Array:
+    """Of a height field that is column `j`: one of its header, or a height."""
+    k = _index(place)
+    return table[k & (ROWS - 1), j + _index(table[_ROUNDING, j]) + k // ROWS]
+
+
+def _height(table: Array, j: Array, x: Array, y: Array) -> Array:
+    """Above the center of a height field, at a place in cells from its first corner, m."""
+    wide = _number(table, j, _ZERO)
+    column = _least(_most(_down(x), _ZERO), wide - _TWO)
+    row = _least(_most(_down(y), _ZERO), _number(table, j, _ONE) - _TWO)
+    x, y = x - column, y - row
+    corner = _HEADER + row * wide + column
+    low, high = _number(table, j, corner), _number(table, j, corner + wide + _ONE)
+    side = _number(table, j, _pick(x > y, corner + _ONE, corner + wide))
+    first, second = _most(x, y), _least(x, y)
+    return low + first * (side - low) + second * (high - side)
+
+
+def _above(table: Array, j: Array, line: Array, t: Array) -> Array:
+    """Of a point of a ray, above the surface, m."""
+    x, y, z, along, across, up = line
+    return z + up * t - _height(table, j, x + along * t, y + across * t)
+
+
+def _hfield(ray: Vector, solid: Array) -> Array:
+    """From one line of the grid to the next: between them the surface is a straight line."""
+    seen, table, j, reach = solid
+    _, u, v, axis, middle, size = seen
+    wide = (_number(table, j, _ZERO) - _ONE) / (size[0] + size[0])
+    deep = (_number(table, j, _ONE) - _ONE) / (size[1] + size[1])
+    x, y = (size[0] - middle[0]) * wide, (size[1] - middle[1]) * deep
+    along, across = _dot(ray, u) * wide, _dot(ray, v) * deep
+    line = (x, y, -middle[2], along, across, _dot(ray, axis))
+    enters, leaves, meets = _box(ray, seen)
+    leaves = _least(leaves, reach)
+    start = _most(enters, _ZERO)
+    gap = _above(table, j, line, start)
+    is_within = gap < _ZERO
+    side = _pick(is_within, -_ONE, _ONE)
+    is_wall = is_within & (enters > _ZERO)
+    met = _pick(is_wall, start, leaves)
+    hits = is_within & meets
+    ended = is_wall | (start >= leaves)
+    t = start
+    first, stride, pace = _lines(x, along, start)
+    second, step, speed = _lines(y, across, start)
+    third, leap, rate = _lines(x - y, along - across, start)
+    count = _number(table, j, _ZERO) + _number(table, j, _ONE)
+    for _ in range(_index(count + count)):
+        one, two, three = (first - x) * pace, (second - y) * speed, (third - (x - y)) * rate
+        end = _most(t, _least(_least(one, two), _least(three, leaves)))
+        after = _above(table, j, line, end)
+        crosses = (side * after <= _ZERO) & (ended < _TRUE)
+        met = _pick(crosses, t + (end - t) * (gap / _nonzero(gap - after)), met)
+        hits = hits | crosses
+        ended = ended | crosses | (end >= leaves)
+        if _all(ended):
+            break
+        first = _pick(one <= end, first + stride, first)
+        second = _pick(two <= end, second + step, second)
+        third = _pick(three <= end, third + leap, third)
+        t = end
+        gap = after
+    return met, met, hits
+
+
+def _lines(x: Array, speed: Array, t: Array) -> Array:
+    """Number of the next line of a grid that a point crosses, of the one behind that less it, and
+    the time between two of them.
+    """
+    is_back = speed < _ZERO
+    following = _down(x + speed * t) + _pick(is_back, _ZERO, _ONE)
+    return following, _pick(is_back, -_ONE, _ONE), _ONE / _nonzero(speed)
+
+
+def _met(kind: Array, ray: Vector, solid: Array, table: Array, j: Array, reach: Array) -> Array:
+    """As the formula of a kind."""
+    if kind == _SPHERE:
+        return _sphere(ray, solid)
+    if kind == _CAPSULE:
+        return _capsule(ray, solid)
+    if kind == _CYLINDER:
+        return _cylinder(ray, solid)
+    if kind == _BOX:
+        return _box(ray, solid)
+    if kind == _PLANE:
+        return _plane(ray, solid)
+    return _hfield(ray, (solid, table, j, reach))
 
 
 def _nearer(old: Array, enters: Array, leaves: Array, meets: Array) -> Array:
@@ -194,15 +306,20 @@ def _seen(table: Array, j: Array, place: Array, attitude: Array) -> Array:
     return center, u, v, axis, middle, (a, b, c, c - table[_ROUNDING, j])
 
 
-def _gap(kind: Array, table: Array, j: Array, point: Vector) -> Array:
-    """From a point to a primitive, m; below 0 within it."""
+def _local(table: Array, j: Array, point: Vector) -> Vector:
+    """A point from the center of a primitive, along its axes."""
     x, y, z = _three(table, _CENTER, j)
     away = (point[0] - x, point[1] - y, point[2] - z)
+    along = _dot(away, _three(table, _U, j))
+    across = _dot(away, _three(table, _V, j))
+    return along, across, _dot(away, _three(table, _AXIS, j))
+
+
+def _gap(kind: Array, table: Array, j: Array, point: Vector, radius: Array) -> Array:
+    """From a point to a primitive but a height field, m; below 0 within it."""
+    along, across, up = _local(table, j, point)
+    along, across = abs(along), abs(across)
     a, b, c = _three(table, _SIZE, j)
-    radius = table[_ROUNDING, j]
-    along = abs(_dot(away, _three(table, _U, j)))
-    across = abs(_dot(away, _three(table, _V, j)))
-    up = _dot(away, _three(table, _AXIS, j))
     is_round = kind == _CYLINDER
     along = _pick(is_round, _root(along * along + across * across), along) - (a - radius)
     across = _pick(is_round, _ZERO, across) - (b - radius)
@@ -213,10 +330,79 @@ def _gap(kind: Array, table: Array, j: Array, point: Vector) -> Array:
     return _pick(kind == _PLANE, up, gap)
 
 
+def _gap_of_hfield(table: Array, j: Array, point: Vector) -> Array:
+    """As `_gap`, exact up to the width of a cell; beyond it a lower bound."""
+    along, across, up = _local(table, j, point)
+    a, b, _ = _three(table, _SIZE, j)
+    last, final = _number(table, j, _ZERO) - _TWO, _number(table, j, _ONE) - _TWO
+    wide, deep = (a + a) / (last + _ONE), (b + b) / (final + _ONE)
+    place = (along + a, across + b, up)
+    x = _most(_least(place[0] / wide, last + _ONE), _ZERO)
+    y = _most(_least(place[1] / deep, final + _ONE), _ZERO)
+    over = up - _height(table, j, x, y)
+    column, row = _least(_down(x), last), _least(_down(y), final)
+    x, y = x - column, y - row
+    aside = _least((_ONE + _least(x, _ONE - x)) * wide, (_ONE + _least(y, _ONE - y)) * deep)
+    square = _BIG
+    for m in _AROUND:
+        for n in _AROUND:
+            p = _most(_least(row + m, final), _ZERO)
+            q = _most(_least(column + n, last), _ZERO)
+            low = _corner(table, j, p, q, wide, deep, place)
+            high = _corner(table, j, p + _ONE, q + _ONE, wide, deep, place)
+            right = _corner(table, j, p, q + _ONE, wide, deep, place)
+            left = _corner(table, j, p + _ONE, q, wide, deep, place)
+            square = _least(square, _least(_triangle(low, right, high), _triangle(low, high, left)))
+    beyond = _most(aside, abs(over) * _number(table, j, _TWO))
+    near = _least(_root(square), beyond)
+    return _most(_gap(_BOX, table, j, point, _ZERO), _pick(over < _ZERO, -near, near))
+
+
+def _corner(
+    table: Array, j: Array, row: Array, column: Array, wide: Array, deep: Array, place: Vector
+) -> Vector:
+    """Of a grid with cells of a width and a depth, from a place."""
+    height = _number(table, j, _HEADER + row * _number(table, j, _ZERO) + column)
+    return _minus((column * wide, row * deep, height), place)
+
+
+def _minus(a: Vector, b: Vector) -> Vector:
+    return a[0] - b[0], a[1] - b[1], a[2] - b[2]
+
+
+def _cross(a: Vector, b: Vector) -> Vector:
+    return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
+
+
+def _triangle(p: Vector, q: Vector, r: Vector) -> Array:
+    """Square of the distance of the origin."""
+    first, second, third = _minus(q, p), _minus(r, q), _minus(p, r)
+    normal = _cross(first, third)
+    across = _dot(normal, p)
+    is_before = _dot(_cross(first, normal), p) <= _ZERO
+    is_beside = _dot(_cross(second, normal), q) <= _ZERO
+    is_behind = _dot(_cross(third, normal), r) <= _ZERO
+    edge = _least(_edge(p, first), _least(_edge(q, second), _edge(r, third)))
+    flat = across * across / _dot(normal, normal)
+    return _pick(is_before & is_beside & is_behind, flat, edge)
+
+
+def _edge(start: Vector, way: Vector) -> Array:
+    """Square of the distance of the origin from a line that leads a way from its start."""
+    share = _least(_most(-_dot(start, way) / _dot(way, way), _ZERO), _ONE)
+    near = (start[0] + share * way[0], start[1] + share * way[1], start[2] + share * way[2])
+    return _dot(near, near)
+
+
 def distances(kinds: Array, table: Array, points: Array) -> Array:
     """From points, (N, 3), to the nearest primitive of a table, m, (N,), by NumPy."""
-    gaps = _gap(kinds, table, slice(None), points.T[:, :, None])
+    plain = kinds < _HFIELD
+    solids = table[:, plain]
+    everything = slice(None)
+    gaps = _gap(kinds[plain], solids, everything, points.T[:, :, None], solids[_ROUNDING])
     nearest: Array = gaps.min(axis=1, initial=np.inf)
+    for j in np.flatnonzero(kinds == _HFIELD).tolist():
+        nearest = _least(nearest, _gap_of_hfield(table, j, points.T))
     return nearest
 
 
@@ -224,9 +410,18 @@ def _nearest(kinds: Array, table: Array, x: Array, y: Array, z: Array) -> Array:
     """From a point to the nearest primitive of a layout but the first, the ground, m; 1e30 if there
     is none.
     """
+    others = 0
+    for j in range(1, kinds.size):
+        others += kinds[j] >= _HFIELD
     nearest = _BIG
     for j in range(1, kinds.size):
-        nearest = _least(nearest, _gap(kinds[j], table, j, (x, y, z)))
+        kind = kinds[j]
+        if others == 0:  # decided before the loop, which becomes vectors
+            nearest = _least(nearest, _gap(kind, table, j, (x, y, z), table[_ROUNDING, j]))
+        elif kind == _HFIELD:
+            nearest = _least(nearest, _gap_of_hfield(table, j, (x, y, z)))
+        elif kind < _HFIELD:
+            nearest = _least(nearest, _gap(kind, table, j, (x, y, z), table[_ROUNDING, j]))
     return nearest
 
 
@@ -237,19 +432,10 @@ def _first(
     found = _BIG
     ray = (dx, dy, dz)
     for j in range(1, kinds.size):
-        solid = _seen(table, j, (x, y, z), _UNTURNED)
-        kind = kinds[j]
-        if kind == _SPHERE:
-            enters, leaves, meets = _sphere(ray, solid)
-        elif kind == _CAPSULE:
-            enters, leaves, meets = _capsule(ray, solid)
-        elif kind == _CYLINDER:
-            enters, leaves, meets = _cylinder(ray, solid)
-        elif kind == _BOX:
-            enters, leaves, meets = _box(ray, solid)
-        else:
-            enters, leaves, meets = _plane(ray, solid)
-        found = _nearer(found, enters, leaves, meets)
+        if kinds[j] < REST:
+            solid = _seen(table, j, (x, y, z), _UNTURNED)
+            enters, leaves, meets = _met(kinds[j], ray, solid, table, j, _BIG)
+            found = _nearer(found, enters, leaves, meets)
     return found
 
 
@@ -341,7 +527,7 @@ def _packets(
                 aside[f], aside[5 + f], aside[10 + f] = _turned_back(attitude[w], whole[f])
             _hide(table, place[w], aside, far)
         for j in range(kind.size):
-            if far[j] > reach + _MARGIN:
+            if far[j] > reach + _MARGIN or kind[j] == REST:
                 continue
             solid = _seen(table, j, place[w], attitude[w])
             if kind[j] == _PLANE:
@@ -351,6 +537,10 @@ def _packets(
             if kind[j] == _BOX:
                 _look(_depth, planes, solid, hits)
                 _meet(_box, solid, hit, directions, found)
+                continue
+            if kind[j] == _HFIELD:
+                _look(_depth, planes, solid, hits)
+                _meet_hfield((solid, table, j, reach), hit, directions, found)
                 continue
             _look(_depth_of_round, planes, solid, hits)
             if kind[j] == _SPHERE:
@@ -366,11 +556,10 @@ def _packets(
 def _ranges(table: Array, place: Array, far: Array) -> None:
     """Distances of a point to the boxes about primitives."""
     for j in range(far.size):
-        x, y, z = _three(table, _CENTER, j)
-        away = (place[0] - x, place[1] - y, place[2] - z)
-        a = _most(abs(_dot(away, _three(table, _U, j))) - table[_SIZE, j], _ZERO)
-        b = _most(abs(_dot(away, _three(table, _V, j))) - table[_SIZE + 1, j], _ZERO)
-        c = _most(abs(_dot(away, _three(table, _AXIS, j))) - table[_SIZE + 2, j], _ZERO)
+        along, across, up = _local(table, j, (place[0], place[1], place[2]))
+        a = _most(abs(along) - table[_SIZE, j], _ZERO)
+        b = _most(abs(across) - table[_SIZE + 1, j], _ZERO)
+        c = _most(abs(up) - table[_SIZE + 2, j], _ZERO)
         far[j] = _root(a * a + b * b + c * c)
 
 
@@ -434,6 +623,10 @@ def _meet(formula: Function, solid: Array, hit: Array, directions: Array, found:
             _shorten(formula, solid, directions[k], found[k])
 
 
+def _meet_hfield(solid: Array, hit: Array, directions: Array, found: Array) -> None:
+    _meet(_hfield, solid, hit, directions, found)
+
+
 def _shorten(formula: Function, solid: Array, d: Array, t: Array) -> None:
     for i in range(LANES):
         ray = (d[i], d[LANES + i], d[2 * LANES + i])
@@ -448,11 +641,11 @@ def by_numpy(
     """As `_packets`, and nothing is left out."""
     ray = [directions[:, first : first + LANES] for first in range(0, 3 * LANES, LANES)]
     for w in range(len(out)):
-        kind = kinds[which[w]]
+        kind, table = kinds[which[w]], tables[which[w]]
         found = np.full(ray[0].shape, reach)
-        for j in range(kind.size):
-            solid = _seen(tables[which[w]], j, place[w], attitude[w])
-            found = _nearer(found, *_MEETINGS[kind[j]](ray, solid))
+        for j in np.flatnonzero(kind < REST).tolist():
+            solid = _seen(table, j, place[w], attitude[w])
+            found = _nearer(found, *_met(kind[j], ray, solid, table, j, reach))
         out[w] = found.ravel()[slots]
 
 
@@ -472,28 +665,15 @@ class Compiled(NamedTuple):
     """Of the code there."""
 
 
-@cache
-def compiled() -> Compiled | None:
-    """Kernels by Numba, or None where it is not installed: the extra `fast` brings it."""
-    try:
-        import numba
-        from llvmlite import ir
-        from numba import cfunc, njit, types
-        from numba.core.cpu import CPUTargetOptions
-        from numba.core.options import TargetOptions
-        from numba.extending import intrinsic
-    except ImportError:
-        return None
-    # No array overlaps another one: Numba can be told so, but has no public option for it.
-    mapping: Function = TargetOptions.Mapping
-    setattr(CPUTargetOptions, "noalias", mapping("noalias"))  # noqa: B010
-    options: Options = {"error_model": "numpy", "boundscheck": False, "nogil": True}
+def _one_instruction() -> Function:
+    """The lesser of two numbers. Of `a if a < b else b`, before a store, LLVM makes a masked store,
+    and of a loop of them no vectors.
+    """
+    from llvmlite import ir
+    from numba.extending import intrinsic
 
     @intrinsic
     def least(_: Numba, a: Numba, b: Numba) -> Numba:
-        """One instruction. Of `a if a < b else b`, before a store, LLVM makes a masked store, and
-        of a loop of them no vectors."""
-
         def emit(_: Numba, builder: Numba, __: Numba, given: Numba) -> Numba:
             number = ir.FloatType()
             kind = ir.FunctionType(number, [number, number])
@@ -502,26 +682,50 @@ def compiled() -> Compiled | None:
 
         return a(a, a), emit
 
-    names: Options = dict(globals())
+    return least
+
+
+@cache
+def compiled() -> Compiled | None:
+    """Kernels by Numba, or None where it is not installed: the extra `fast` brings it."""
+    try:
+        import numba
+        from numba import cfunc, njit, types
+        from numba.core.cpu import CPUTargetOptions
+        from numba.core.options import TargetOptions
+    except ImportError:
+        return None
+    # No array overlaps another one: Numba can be told so, but has no public option for it.
+    mapping: Function = TargetOptions.Mapping
+    setattr(CPUTargetOptions, "noalias", mapping("noalias"))  # noqa: B010
+    options: Options = {"error_model": "numpy", "boundscheck": False, "nogil": True}
+
     inner: Options = {**options, "forceinline": True, "noalias": True}
     inline: Function = njit(**inner)
-    names["_least"] = least
+    names: Options = dict(globals())
+
+    def own(function: Function) -> Function:
+        """Its code, which calls what `names` has."""
+        return FunctionType(function.__code__, names)
+
+    for name, function in globals().items():
+        if isinstance(function, FunctionType):
+            names[name] = inline(own(function))
+    names["_least"] = _one_instruction()
     names["_most"] = inline(lambda a, b: a if a > b else b)
     names["_pick"] = inline(lambda flag, yes, no: yes if flag else no)
     names["_root"] = inline(lambda x: np.sqrt(x))
-    inlined = (
-        _dot, _nonzero, _sphere, _ball, _side, _cylinder, _capsule, _box, _plane, _nearer, _three,
-        _turned, _turned_back, _seen, _gap, _nearest, _first, _ranges, _hide, _depth,
-        _depth_of_round, _look, _shorten, _meet,
-    )  # fmt: skip
-    for function in inlined:
-        names[function.__name__] = inline(FunctionType(function.__code__, names))
+    names["_down"] = inline(lambda x: np.floor(x))
+    names["_index"] = inline(lambda x: int(x))
+    names["_all"] = inline(lambda flag: flag)
+    for large in (_gap_of_hfield, _meet_hfield):  # inlined, they would slow the others
+        names[large.__name__] = njit(**options)(own(large))
     table, row, numbers = "f4[:,:,::1]", "i8[::1]", "f4[:,::1]"
     kinds = ["int8[:,::1]", table, row, *[numbers] * 5, "u8[::1]", "f4", numbers]
     whole: Options = {**options, "cache": True}
-    packets = njit(f"void({','.join(kinds)})", **whole)(FunctionType(_packets.__code__, names))
+    packets = njit(f"void({','.join(kinds)})", **whole)(own(_packets))
     kinds = ["int8[:,::1]", table, row, table, "b1[:,::1]", numbers]
-    gaps = njit(f"void({','.join(kinds)})", **whole)(FunctionType(_gaps.__code__, names))
+    gaps = njit(f"void({','.join(kinds)})", **whole)(own(_gaps))
     names["_array"] = vars(numba)["carray"]
     number = types.float32
     pointer: Numba = types.CPointer
@@ -529,7 +733,7 @@ def compiled() -> Compiled | None:
     def by_address(function: Function, count: int) -> Numba:
         """A function of C of a layout and so many further numbers."""
         kind = number(types.int64, pointer(types.int8), pointer(number), *[number] * count)
-        return cfunc(kind, cache=True)(FunctionType(function.__code__, names))
+        return cfunc(kind, cache=True)(own(function))
 
     nearest, first = owners = by_address(_nearest_at, 3), by_address(_first_at, 6)
     return Compiled(packets, gaps, nearest.address, first.address, owners)

@@ -7,15 +7,20 @@ from typing import Any
 
 import mujoco
 import numpy as np
-from mujoco import MjSpec, mjtGeom
+from mujoco import MjsGeom, MjSpec, mjtGeom
 from numpy.typing import ArrayLike as Vector
+from numpy.typing import NDArray
 
 from .config import SceneConfig
-from .generators import parts_of
+from .fields import least_of
+from .generators import Parts, parts_of
 from .kernels import KINDS
+
+Array = NDArray[np.float64]
 
 GROUP = 2
 """Group of the geoms of a scene."""
+_LEAST = 1e-6  # m: height and depth of a field, which MuJoCo wants above 0
 SKY = mujoco.mjtTexture.mjTEXTURE_SKYBOX
 HALL_XML = Path(__file__).with_name("hall.xml")
 """Walls, windows, roof, lamps and racks of the warehouse."""
@@ -42,16 +47,47 @@ def add_parts(spec: MjSpec, scene: SceneConfig) -> None:
         walls = MjSpec.from_file(str(HALL_XML))
         spec.attach(walls, prefix="warehouse/", frame=spec.worldbody.add_frame())
     for parts in parts_of(scene, scene.seed):
-        names = parts.names()
-        materials = parts.materials()
-        for i, turn in enumerate(parts.headings.tolist()):
-            quaternion = (math.cos(turn / 2), 0.0, 0.0, math.sin(turn / 2))
-            spec.worldbody.add_geom(
-                name=f"{scene.name}/{names[i]}", type=GEOM_TYPES[parts.kinds[i]],
-                size=parts.sizes[i], pos=parts.positions[i], quat=quaternion,
-                material=f"{scene.name}/{materials[i]}", contype=0, conaffinity=0,
-                group=GROUP, mass=0.0, density=0.0,
-            )  # fmt: skip
+        for geom, material in zip(
+            add_geoms(spec, scene.name, parts), parts.materials(), strict=True
+        ):
+            geom.material = f"{scene.name}/{material}"
+
+
+def add_geoms(spec: MjSpec, scene: str, parts: Parts) -> list[MjsGeom]:
+    """Add parts of a scene to a spec, which touch and weigh nothing."""
+    geoms = []
+    for i, own in enumerate(parts.names()):
+        name = f"{scene}/{own}"
+        quaternion = np.empty(4)
+        mujoco.mju_mat2Quat(quaternion, parts.axes[i].ravel())
+        shape = shape_of(spec, name, parts.sizes[i], parts.grids[i])
+        position = parts.positions[i] + least_of(parts.grids[i]) * parts.axes[i, :, 2]
+        geom = spec.worldbody.add_geom(
+            name=name, type=GEOM_TYPES[parts.kinds[i]], pos=position, quat=quaternion,
+            contype=0, conaffinity=0, group=GROUP, mass=0.0, density=0.0, **shape,
+        )  # fmt: skip
+        geoms.append(geom)
+    return geoms
+
+
+def shape_of(spec: MjSpec, name: str, size: Vector, grid: Array | None) -> dict[str, object]:
+    """Arguments of a geom for its size.
+
+    The heights of a `grid` above a position, m, (rows, columns), are added to the spec: the geom
+    lies at the least of them. Its size is half its width along x and y, and its depth below that
+    position.
+    """
+    if grid is None:
+        return {"size": size}
+    low = grid.min()
+    tall = max(grid.max() - low, _LEAST)
+    a, b, depth = np.asarray(size).tolist()
+    rows, columns = grid.shape
+    spec.add_hfield(
+        name=name, size=(a, b, tall, max(depth + low, _LEAST)), nrow=rows, ncol=columns,
+        userdata=((grid - low) / tall).ravel(),
+    )  # fmt: skip
+    return {"hfieldname": name}
 
 
 class Painter:

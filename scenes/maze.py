@@ -8,17 +8,17 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from ..models.fields import immutable
 from .kernels import KINDS
+from .options import Clear, Size
 
 if TYPE_CHECKING:
-    from .config import SceneConfig
     from .generators import Draft
 
 Array = NDArray[np.float64]
 
 CELL = 3.0
 """Width of a corridor with one of its walls, m."""
-_SIZE = (48.0, 48.0)  # m
 _HALF_HEIGHT = 2.0  # m, of a wall
 _HALF_THICKNESS = 0.1  # m
 _LOOPS = 0.1  # share of the walls that is left out, so that ways lead round in circles
@@ -26,15 +26,30 @@ _MIDDLE = 11.4  # m: radius of the clear space about the z axis, a square of 16 
 _ENDS = 2.0  # m: radius of the clear spaces at the ends
 
 
-def most_walls(scene: "SceneConfig") -> int:
-    """Upper bound of the number of parts of a maze."""
-    columns, rows = _cells(scene)
-    return columns * rows + 5
+@immutable
+class MazeOptions(Clear):
+    """Options of the scene `maze`."""
+
+    size: Size = (48.0, 48.0)
+    least = 30.0
+
+    @property
+    def cells(self) -> tuple[int, int]:
+        """Cells along x and y."""
+        wide, deep = self.size
+        return int(wide / CELL), int(deep / CELL)
+
+    @property
+    def most(self) -> int:
+        """As `SceneOptions.most`."""
+        columns, rows = self.cells
+        return columns * rows + 5
 
 
 def maze(draft: "Draft") -> None:
     """Walls along the sides of square cells, and around all of them."""
-    columns, rows = _cells(draft.scene)
+    options: MazeOptions = draft.options
+    columns, rows = options.cells
     half = CELL / 2 * np.array([columns, rows])
     wide, deep = half.tolist()
     edge = 2 * max(wide, deep)
@@ -52,7 +67,7 @@ def maze(draft: "Draft") -> None:
     centers = CELL * middles - half
     long = CELL / 2 + _HALF_THICKNESS
     reach = np.where(along_x, (long, _HALF_THICKNESS), (_HALF_THICKNESS, long))
-    place, room = ((wide - _ENDS, 0.0), _ENDS) if draft.scene.clear == "ends" else ((0, 0), _MIDDLE)
+    place, room = ((wide - _ENDS, 0.0), _ENDS) if options.clear == "ends" else ((0, 0), _MIDDLE)
     gap = np.maximum(abs(abs(centers) - place) - reach, 0.0)
     kept = ~is_open & (np.hypot(*gap.T) >= room)
     count = int(kept.sum())
@@ -64,12 +79,6 @@ def maze(draft: "Draft") -> None:
         np.column_stack((centers[kept], tall)),
         lambda: ["wall"] * count,
     )
-
-
-def _cells(scene: "SceneConfig") -> tuple[int, int]:
-    """How many cells there are along x and y."""
-    wide, deep = scene.size or _SIZE
-    return int(wide / CELL), int(deep / CELL)
 
 
 def _sides(columns: int, rows: int) -> tuple[Array, NDArray[np.bool_], NDArray[np.int64]]:

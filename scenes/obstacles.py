@@ -7,6 +7,9 @@ from dataclasses import fields
 from functools import lru_cache
 from typing import Annotated
 
+import mujoco
+import numpy as np
+
 from ..models.errors import InputError, shortened
 from ..models.fields import (
     Choice,
@@ -19,10 +22,16 @@ from ..models.fields import (
     read_table,
 )
 from ..models.files import MAX_BYTES, parse_toml
+from ..models.matrices import settled
+from .fields import Heights, centered
+from .generators import Parts
 from .kernels import KINDS
+from .motion import REST
 from .registry import MAX_SOLIDS
 
-SIZES = {"sphere": 1, "capsule": 2, "cylinder": 2, "box": 3, "plane": 0}
+OWN = "own"
+"""Before the names of a file's obstacles."""
+SIZES = {"sphere": 1, "capsule": 2, "cylinder": 2, "box": 3, "plane": 0, "hfield": 3}
 """How many numbers the size of each kind has."""
 _WORD = Text(r"([A-Za-z][\w-]{0,31})?", "a word of at most 32 letters, digits, - and _")
 
@@ -34,10 +43,13 @@ class Obstacle:
     kind: Annotated[str, Choice(KINDS)]
     size: Annotated[tuple[float, ...], Limits(1e-4, 1e4, "m", count=0, least=0)] = ()
     """As MuJoCo has them: radius; radius and half the length, without the round ends of a capsule;
-    half the sides of a box along x, y and z. A plane has no end and no size: its z axis points out
-    of it."""
+    half the sides of a box along x, y and z; those of a height field along x and y, and its depth
+    below its position. A plane has no end and no size: its z axis points out of it."""
+    heights: Annotated[tuple[tuple[float, ...], ...], Heights()] = ()
+    """Of a height field above its position, m: rows from the least y on, each from the least x
+    on."""
     position: Annotated[tuple[float, ...], Limits(-1e4, 1e4, "m", count=3)] = (0.0, 0.0, 0.0)
-    """Of its center."""
+    """Of its center; of a height field of the middle of its ground."""
     heading: Annotated[float, Limits(-360.0, 360.0, "degrees")] = 0.0
     """Turn about z, anticlockwise, instead of a `quaternion`."""
     quaternion: Annotated[tuple[float, ...], Direction(-1e3, 1e3, count=4)] = (1.0, 0.0, 0.0, 0.0)
@@ -57,6 +69,10 @@ class Obstacle:
                 f"obstacle: expected a size of {count} numbers for a {self.kind}, "
                 f"got {len(self.size)}"
             )
+        if bool(self.heights) != (self.kind == "hfield"):
+            raise InputError(f"obstacle: expected heights of an hfield alone, got a {self.kind}")
+        if self.heights and min(map(min, self.heights)) < -self.size[2]:
+            raise InputError("obstacle: expected heights above the depth of the field, got others")
 
     @property
     def attitude(self) -> tuple[float, ...]:
@@ -83,7 +99,7 @@ def to_content(obstacles: Iterable[Obstacle]) -> str:
             value = getattr(one, field.name)
             if value != field.default:
                 lines.append(f"{field.name} = {json.dumps(value)}")
-    content = "\n".join(lines)
+    content = "\n".join(lines) or "obstacle = []"
     if len(content) > MAX_BYTES:
         raise InputError(
             f"obstacle: expected text of at most {MAX_BYTES} bytes, got {len(content)}"
@@ -108,6 +124,29 @@ def obstacles_in(file: Mapping[str, object]) -> tuple[Obstacle, ...]:
     return tuple(read_table(Obstacle, table, "obstacle") for table in tables)
 
 
-def names_of(obstacles: Sequence[Obstacle]) -> tuple[str, ...]:
-    """Of scene, object and part, as those of our scenes."""
-    return tuple(f"own/{one.label or one.kind}_{i}/{one.kind}" for i, one in enumerate(obstacles))
+def parts_of_obstacles(obstacles: Sequence[Obstacle]) -> Parts:
+    """The same as parts of the scene `OWN`. Names have object and part, as those of our scenes."""
+    count = len(obstacles)
+    sizes = np.zeros((count, 3))
+    axes = np.zeros((count, 3, 3))
+    centers = np.array([one.position for one in obstacles]).reshape(-1, 3)
+    grids = np.full(count, None)
+    for i, one in enumerate(obstacles):
+        sizes[i, : len(one.size)] = one.size
+        mujoco.mju_quat2Mat(axes[i].reshape(9), np.array(one.attitude))
+        if one.heights:
+            middle, grids[i] = centered(np.array(one.heights), one.size[2])
+            sizes[i, 2] += middle
+            centers[i] += middle * axes[i, :, 2]
+    return Parts(
+        names=lambda: [
+            f"{one.label or one.kind}_{i}/{one.kind}" for i, one in enumerate(obstacles)
+        ],
+        kinds=np.array([KINDS.index(one.kind) for one in obstacles], np.int8),
+        sizes=sizes,
+        positions=centers,
+        materials=lambda: [""] * count,
+        axes=settled(axes),
+        motions=np.zeros((count, len(REST))),
+        grids=grids,
+    )

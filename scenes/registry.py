@@ -6,17 +6,13 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Final
 
 from ..models.errors import InputError, shortened
+from .options import SceneOptions
 
 if TYPE_CHECKING:
-    from .config import SceneConfig
     from .generators import Draft
 
-CLEARANCE = 8.0
-"""Of our scenes the `room`, m."""
 MAX_SOLIDS = 10_000
 """Most primitives of a scene."""
-MAX_DRAWN = 512
-"""Most parts that a generator draws, unless its scene states another number."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -27,14 +23,10 @@ class SceneType:
     """Adds the parts of a layout to a `Draft`, all of them from its stream of random numbers."""
     materials: Mapping[str, Any] = field(default_factory=dict)
     """Looks by name, as in `materials.toml`."""
-    most: "Callable[[SceneConfig], int]" = lambda _: MAX_DRAWN
-    """Upper bound of the number of parts of a layout."""
-    room: float = CLEARANCE
-    """Half the width of the square about the z axis that a layout keeps free up to 20 m, m."""
+    options: type[SceneOptions] = SceneOptions
+    """Options of a layout, and what follows from them."""
     moves: bool = False
     """Whether some of its solids move."""
-    options: tuple[str, ...] = ()
-    """Which of `density`, `size` and `clear` it has."""
 
 
 SCENES: Final[dict[str, SceneType]] = {"plain": SceneType(), "airport": SceneType()}

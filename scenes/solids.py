@@ -16,21 +16,21 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..models.errors import InputError, shortened
 from ..models.fields import Limits, check
-from ..models.matrices import settled
 from . import kernels
 from .build import HIDDEN_GROUP, add_scene, is_ground
 from .config import SceneConfig, parse_scene
+from .fields import centered, check_points
 from .generators import Parts, parts_of
 from .looks import HALL_XML
 from .motion import REST, offsets
-from .obstacles import Obstacle, names_of, obstacles_of
+from .obstacles import OWN, Obstacle, obstacles_of, parts_of_obstacles
 from .registry import MAX_SOLIDS
 
 Array = NDArray[np.float64]
 
 MAX_CELLS = 1 << 26
 """Most cells of a grid, which takes 0.5 GB then."""
-_SPHERE, _CAPSULE, _CYLINDER, _, _PLANE = range(len(kernels.KINDS))
+_SPHERE, _CAPSULE, _CYLINDER, _, _PLANE, _HFIELD = range(len(kernels.KINDS))
 _SIZE = Limits(1e-4, 1e4, "m")
 _ENDLESS = 1e6  # m: half the width of a plane
 _SHEET = 5e-4  # m: half the thickness of a plane of a size, which lies below its face
@@ -61,6 +61,9 @@ class Solids:
     """Half the sides of the box about each, along its axes, m, shape (N, 3)."""
     motions: Array
     """As of `motion`, shape (N, 11)."""
+    grids: NDArray[np.object_]
+    """Of a height field its heights above its center, m, shape (rows, columns), the first row at
+    the least y and the first column at the least x; None of another solid. Shape (N,)."""
 
     @classmethod
     def of_scene(cls, scene: str | SceneConfig) -> "Solids":
@@ -76,44 +79,30 @@ class Solids:
     def of_parts(cls, parts: Sequence[Parts], scene: str) -> Self:
         """What stands in a scene from a seed."""
         if not parts:
-            nothing = np.zeros((0, 3))
-            still = np.zeros((0, len(REST)))
-            return cls(tuple, np.zeros(0, np.int8), nothing, np.zeros((0, 3, 3)), nothing, still)
-        _, kinds, sizes, centers, _, turns, motions = zip(*parts, strict=True)
+            return cls.of_obstacles(())
+        _, kinds, sizes, centers, _, axes, motions, grids = zip(*parts, strict=True)
         kind = np.concatenate(kinds)
-        turn = np.concatenate(turns)
-        axes = np.zeros((len(turn), 3, 3))
-        axes[:, 0, 0] = axes[:, 1, 1] = settled(np.cos(turn))
-        axes[:, 1, 0] = settled(np.sin(turn))
-        axes[:, 0, 1] = -axes[:, 1, 0]
-        axes[:, 2, 2] = 1.0
+        half = _halves(kind, np.concatenate(sizes))
+        center = np.concatenate(centers)
+        is_sized = (half >= 0.0) & (half <= _ENDLESS)
+        if not (is_sized & (abs(center) <= _ENDLESS)).all():
+            raise InputError(
+                f"scene: expected sizes and places within 1e6 m, got others in {scene}"
+            )
         return cls(
             label=lambda: tuple(f"{scene}/{name}" for one in parts for name in one.names()),
             kinds=kind,
-            centers=np.concatenate(centers),
-            axes=axes,
-            halves=_halves(kind, np.concatenate(sizes)),
+            centers=center,
+            axes=np.concatenate(axes),
+            halves=half,
             motions=np.concatenate(motions),
+            grids=np.concatenate(grids),
         )
 
     @classmethod
     def of_obstacles(cls, obstacles: Sequence[Obstacle]) -> Self:
         """Those of a file."""
-        count = len(obstacles)
-        kinds = np.array([kernels.KINDS.index(one.kind) for one in obstacles], np.int8)
-        sizes = np.zeros((count, 3))
-        axes = np.zeros((count, 3, 3))
-        for one, size, matrix in zip(obstacles, sizes, axes, strict=True):
-            size[: len(one.size)] = one.size
-            mujoco.mju_quat2Mat(matrix.reshape(9), np.array(one.attitude))
-        return cls(
-            label=lambda: names_of(obstacles),
-            kinds=kinds,
-            centers=np.array([one.position for one in obstacles]).reshape(-1, 3),
-            axes=settled(axes),
-            halves=_halves(kinds, sizes),
-            motions=np.zeros((count, len(REST))),
-        )
+        return cls.of_parts([parts_of_obstacles(obstacles)], OWN)
 
     @classmethod
     def of_model(cls, model: MjModel, which: ArrayLike | None = None) -> Self:
@@ -121,7 +110,7 @@ class Solids:
 
         An ellipsoid is the capsule about it, or the box about a flat one. Level ground, a plane
         that can touch, and one without a size have no end; another is a sheet. Raises `InputError`
-        for meshes and height fields.
+        for meshes.
         """
         if which is None:
             which = (model.geom_contype | model.geom_conaffinity) != 0
@@ -146,19 +135,26 @@ class Solids:
         names = tuple(_name(model, geom) for geom in chosen)
         is_plane = model.geom_type[chosen] == mjtGeom.mjGEOM_PLANE
         is_sheet = (is_plane & (half[:, 2] == _SHEET))[:, None]
+        centers = data.geom_xpos[chosen] - np.where(is_sheet, _SHEET * axes[:, :, 2], 0.0)
+        grids = np.full(len(chosen), None)
+        for i in np.flatnonzero(model.geom_type[chosen] == mjtGeom.mjGEOM_HFIELD).tolist():
+            middle, grids[i] = _field_of(model, chosen[i])
+            half[i, 2] += middle
+            centers[i] += middle * axes[i, :, 2]
         return cls(
             label=lambda: names,
             kinds=np.array([kernels.KINDS.index(kind) for kind in kinds], np.int8),
-            centers=data.geom_xpos[chosen] - np.where(is_sheet, _SHEET * axes[:, :, 2], 0.0),
+            centers=centers,
             axes=axes,
             halves=half,
             motions=np.zeros((len(half), len(REST))),
+            grids=grids,
         )
 
     @classmethod
     def none(cls) -> "Solids":
         """Nothing."""
-        return Solids.of_parts((), "")
+        return Solids.of_obstacles(())
 
     @classmethod
     def ground(cls) -> "Solids":
@@ -201,10 +197,21 @@ class Solids:
     @cached_property
     def table(self) -> Array:
         """As `kernels` has it, shape (16, N)."""
-        is_round = self.kinds < kernels.KINDS.index("cylinder")
+        is_round = self.kinds < _CYLINDER
         rounding = np.where(is_round, self.halves[:, 0], 0.0)
         columns = self.axes.transpose(0, 2, 1).reshape(-1, 9)
-        return np.column_stack((self.centers, columns, self.halves, rounding)).T.copy()
+        table = np.column_stack((self.centers, columns, self.halves, rounding)).T
+        tables = [table]
+        for number in np.flatnonzero(self.kinds == _HFIELD).tolist():
+            table[-1, number] = sum(one.shape[1] for one in tables) - number
+            tables.append(_columns_of(self.grids[number], self.halves[number]))
+        return np.concatenate(tables, axis=1)
+
+    @cached_property
+    def columns(self) -> NDArray[np.int8]:
+        """Kinds of the columns of `table`."""
+        more = self.table.shape[1] - len(self)
+        return np.concatenate((self.kinds, np.full(more, kernels.REST, np.int8)))
 
     def distance(self, points: ArrayLike) -> Array:
         """From points, (..., 3), m, to the nearest solid, m, (...); below 0 within one.
@@ -217,7 +224,7 @@ class Solids:
         rows = given.reshape(-1, 3)
         count = max(1, _CHUNK // max(1, len(self)))
         parts = [
-            kernels.distances(self.kinds, self.table, rows[first : first + count])
+            kernels.distances(self.columns, self.table, rows[first : first + count])
             for first in range(0, len(rows), count)
         ]
         return np.concatenate([np.empty(0), *parts]).reshape(given.shape[:-1])
@@ -295,7 +302,8 @@ class Layouts(NamedTuple):
     @classmethod
     def of(cls, *scenes: Solids) -> Self:
         """Of scenes in their order."""
-        layouts = cls.empty(len(scenes), max(map(len, scenes), default=0))
+        most = max((len(scene.columns) for scene in scenes), default=0)
+        layouts = cls.empty(len(scenes), most)
         for number, scene in enumerate(scenes):
             layouts.put(number, scene)
         return layouts
@@ -323,12 +331,23 @@ class Layouts(NamedTuple):
         """Set a scene, of all that stands in some, for which there is room."""
         first = 0
         for one in scenes:
-            last = first + len(one)
-            self.kinds[number, first:last] = one.kinds
+            last = first + len(one.columns)
+            self.kinds[number, first:last] = one.columns
             self.tables[number, :, first:last] = one.table
             first = last
         self.kinds[number, first:] = 0
         self.tables[number, :, first:] = _NOTHING
+
+
+def _columns_of(grid: Array, half: Array) -> Array:
+    """Columns of a table with the numbers of a height field, (16, n)."""
+    rows, columns = grid.shape
+    along = np.diff(grid, axis=1) * (columns - 1) / (2 * half[0])
+    across = np.diff(grid, axis=0) * (rows - 1) / (2 * half[1])
+    steep = (along * along).max() + (across * across).max()  # at most, of a triangle
+    numbers = np.concatenate(((columns, rows, 1 / np.sqrt(1 + steep)), grid.ravel()))
+    whole = np.pad(numbers, (0, -len(numbers) % kernels.ROWS))
+    return whole.reshape(-1, kernels.ROWS).T
 
 
 def _name(model: MjModel, geom: int) -> str:
@@ -345,6 +364,8 @@ def _primitive(model: MjModel, geom: int) -> tuple[str, Sequence[float], Sequenc
         touches or not a * b or (is_ground(model, geom) and min(a, b) > _MARK)
     ):
         return "plane", (_ENDLESS, _ENDLESS, 0.0), (0, 1, 2)
+    if kind == mjtGeom.mjGEOM_HFIELD:
+        a, b, _, c = model.hfield_size[model.geom_dataid[geom]].tolist()
     order = [0, 1, 2]
     shape = kind.name.removeprefix("mjGEOM_").lower()
     if kind == mjtGeom.mjGEOM_PLANE:
@@ -363,6 +384,17 @@ def _primitive(model: MjModel, geom: int) -> tuple[str, Sequence[float], Sequenc
     for one in half:
         check(f"scene: half a side of {name}", _SIZE, one)
     return shape, half, order
+
+
+def _field_of(model: MjModel, geom: int) -> tuple[float, Array]:
+    """As of `centered`."""
+    number = model.geom_dataid[geom]
+    rows, columns = model.hfield_nrow[number], model.hfield_ncol[number]
+    check_points(rows, columns, f"scene: {_name(model, geom)}")
+    first = model.hfield_adr[number]
+    data = model.hfield_data[first : first + rows * columns].astype(float)
+    _, _, tall, depth = model.hfield_size[number].tolist()
+    return centered(tall * data.reshape(rows, columns), depth)
 
 
 def _halves(kinds: NDArray[np.int8], sizes: Array) -> Array:

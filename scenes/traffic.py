@@ -4,15 +4,29 @@ import math
 from typing import TYPE_CHECKING
 
 from .motion import GRAVITY, along_ellipse, thrown
+from .options import SceneOptions
 
 if TYPE_CHECKING:
-    from .config import SceneConfig
     from .generators import Draft
 
 _POSTS = 4
 _BALLS = 8
 _FIRST_THROW = 1.0  # s
 _THROW_EVERY = 1.0  # s
+
+
+class TrafficOptions(SceneOptions):
+    """Of the scene `traffic`."""
+
+    @property
+    def most(self) -> int:
+        """Balls, posts and the ground."""
+        return _BALLS + _POSTS + 1
+
+    @property
+    def room(self) -> float:
+        """As `SceneOptions.room`."""
+        return 0.0
 
 
 def traffic(field: "Draft") -> None:
@@ -40,8 +54,3 @@ def traffic(field: "Draft") -> None:
         forward, aside, up = ((end - begin) / flight for end, begin in zip(aim, place, strict=True))
         motion = thrown((forward, aside, up + GRAVITY / 2 * flight), start)
         field.add(f"ball_{i}/ball", "sphere", (radius, 0, 0), place, "ball", motion=motion)
-
-
-def most_of_traffic(_: "SceneConfig") -> int:
-    """Balls, posts and the ground."""
-    return _BALLS + _POSTS + 1

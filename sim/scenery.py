@@ -48,13 +48,14 @@ class Scenery(Kept):
         self._always = Solids.ground() + own
         laid = [self._always + self.solids(seed) for seed in self._given.tolist()]
         self.layouts = Layouts.of(*laid)
+        self._largest = max((len(one) - len(self._always) for one in laid), default=0)
         self.openings: Array = np.zeros((worlds, *openings_of(scene, 0).shape))
         self._openings = np.array([self._opened(seed) for seed in self._given.tolist()])
         if self.moves:  # each world has a time of its own
             most = self.most
             self._motions = np.zeros((worlds, most, len(REST)))
             self._places = np.zeros((worlds, most, 3))
-            self.layouts = Layouts.empty(worlds, len(self._always) + most)
+            self.layouts = Layouts.empty(worlds, len(self._always.columns) + most)
             self.which = np.arange(worlds)
             self._lay(np.flatnonzero(self.seeds >= 0))
         self.rows: Array
@@ -68,9 +69,9 @@ class Scenery(Kept):
     def most(self) -> int:
         """Most solids of a layout, as `solids` has them."""
         if not self._given.size:
-            return self.scene.type.most(self.scene)
-        most: int = self.layouts.kinds.shape[1]
-        return most - len(self._always)
+            most_drawn: int = self.scene.values.most
+            return most_drawn
+        return self._largest
 
     def solids(self, seed: int) -> Solids:
         """What stands in a layout, without ground and `own`."""
@@ -83,6 +84,12 @@ class Scenery(Kept):
     def varies(self) -> bool:
         """Whether episodes differ in their layouts, or times in one."""
         return len(self._given) != 1 or self.moves
+
+    @property
+    def given(self) -> list[int]:
+        """Seeds of the given layouts; none where each episode has a new one."""
+        seeds: list[int] = self._given.tolist()
+        return seeds
 
     @property
     def numbers(self) -> Array:
@@ -183,8 +190,8 @@ class Scenery(Kept):
             made[world] = self.solids(seed)
             self.openings[world] = self._opened(seed)
         kinds, tables = self.layouts
-        largest = max(map(len, made.values()), default=0)
-        most = max(kinds.shape[1], len(self._always) + largest)
+        largest = max((len(one.columns) for one in made.values()), default=0)
+        most = max(kinds.shape[1], len(self._always.columns) + largest)
         if kinds.shape != (count, most):
             old = self.layouts
             kinds, tables = self.layouts = Layouts.empty(count, most)
@@ -209,7 +216,7 @@ class Scenery(Kept):
     @property
     def centers(self) -> Array:
         """Centers of what stands in the layouts, views, (S, 3, P)."""
-        first = len(self._always)
+        first = len(self._always.columns)
         return self.layouts.tables[:, :3, first : first + self.most]
 
     def _point(self) -> None:
@@ -230,7 +237,7 @@ def _single(vectors: Array) -> Array:
 
 def own_solids(vehicle: Vehicle, *, felt: bool) -> Solids:
     """Obstacles of a vehicle's file. Those that touch is computed from, `felt`, have to be
-    primitives: others raise `InputError`. Otherwise meshes and height fields are left out.
+    primitives: others raise `InputError`. Otherwise meshes are left out.
     """
     model = vehicle.model
     ours = craft_geoms(model)
@@ -240,5 +247,5 @@ def own_solids(vehicle: Vehicle, *, felt: bool) -> Solids:
         got = model.geom(int(moving.argmax())).name or "one that is moved"
         raise InputError(f"vehicle: expected obstacles that stand still on rigid, got {got}")
     if not felt:
-        which &= ~np.isin(model.geom_type, (mjtGeom.mjGEOM_MESH, mjtGeom.mjGEOM_HFIELD))
+        which &= model.geom_type != mjtGeom.mjGEOM_MESH
     return Solids.of_model(model, which).standing()

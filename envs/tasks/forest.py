@@ -5,10 +5,8 @@ from typing import Annotated, Any, ClassVar
 
 import numpy as np
 
-from ...models import InputError
 from ...models.fields import Limits, NumberOrPair, immutable
 from ...scenes import SceneConfig
-from ...scenes.config import MAX_TREES
 from ...sim import (
     Array,
     Draw,
@@ -37,7 +35,6 @@ _ASIDE = 0.015  # 1/m: cost of another height than the goal's, by up to 1 m
 _NEAR = 0.03  # cost of a step that touches; e times less each 0.25 m further off
 _CHANGE = 0.005  # cost of the square of a change of the action, up to 2
 _ARRIVAL = 1.0
-_SHARE = 0.8  # of an episode in which the goal can be reached at the wanted speed
 _FAST = 1.05  # of the wanted speed: more speed earns nothing
 
 
@@ -53,13 +50,6 @@ class ForestOptions(TaskOptions):
     """From start to goal, m."""
     width: Annotated[float, Limits(10.0, 100.0, "m")] = 16.0
     """Of the wood, m."""
-
-    def check(self) -> None:
-        """Refuse more trees than a scene may have. Raises `InputError`."""
-        trees = round((self.way + 2 * AISLE) * self.width * self.density)
-        if trees > MAX_TREES:
-            expected = f"at most {MAX_TREES} trees"
-            raise InputError(f"density, way and width: expected {expected}, got {trees}")
 
 
 class Forest(Task):
@@ -124,30 +114,18 @@ class Forest(Task):
     def scene(cls, options: Any) -> SceneConfig:
         """A new wood in each episode."""
         size = options.way + 2 * AISLE, options.width
-        return SceneConfig(
-            name="forest", layouts="new", density=options.density, size=size, clear="ends"
-        )
+        more = {"density": options.density, "size": size, "clear": "ends"}
+        return SceneConfig(name="forest", layouts="new", options=more)
 
     def setup(self) -> None:
         """See the class."""
         options = self.options
-        scene = self.config.scene
-        long = (scene.size or (0.0,))[0] >= options.way + 2 * AISLE
-        if scene.name == "forest" and not (scene.clear == "ends" and long):
-            expected = f"clear=ends and at least {options.way + 2 * AISLE:g} m along x"
-            raise InputError(f"scene: expected {expected}, got {scene}")
         self.define_way(options.way, options.width)
 
     def define_way(self, way: float, width: float) -> None:
         """Set `observation`, for a way to the goal and the width about it, m."""
-        options = self.options
         self._half = way / 2
         self._aside = width / 2
-        slowest, _ = ends_of(options.speed)
-        least = way / (_SHARE * self.episode_length * self.control_period)
-        if slowest < least and self.episode_length == type(self).episode_length:
-            expected = f"at least {least:.3g} m/s, for {way:g} m in the time of an episode"
-            raise InputError(f"speed: expected {expected}, got {slowest:g}")
         furthest = way + width
         numbers = along("wanted velocity", "m/s", MAX_SPEED, "xy")
         numbers.append(Number("goal - height", "m", -10.0, 10.0))

@@ -6,7 +6,7 @@ from typing import Annotated, ClassVar
 from ...models import InputError
 from ...models.fields import Limits, immutable
 from ...scenes import SceneConfig
-from ...scenes.config import GATES_SIZE, OPENING
+from ...scenes.generators import GATES_SIZE, OPENING
 from ...sim import Array, Draw, InitialState, square_root, stack
 from .goal import Distance, Margin
 from .racing import MAX_LAPS, Racing
@@ -64,18 +64,19 @@ class Gates(Racing):
     def scene(cls, options: GatesOptions) -> SceneConfig:
         """A new track in each episode."""
         side = GATES_SIZE * options.opening / OPENING
-        return SceneConfig(name="gates", layouts="new", size=(side, side))
+        return SceneConfig(name="gates", layouts="new", options={"size": (side, side)})
 
     def setup(self) -> None:
         """See the class."""
         scene = self.config.scene
         if scene.name != "gates":
             raise InputError(f"scene: expected gates with {self.config.env_id}, got {scene}")
-        half = scene.scale * OPENING / 2
+        scale = scene.values.scale
+        half = scale * OPENING / 2
         if half <= self.vehicle.radius:
             expected = f"gates wider than the craft, {2 * self.vehicle.radius:.3g} m"
             raise InputError(f"opening: expected {expected}, got {2 * half:g} m")
-        reach = 2 * scene.scale * _RING + 2 * self.options.margin
+        reach = 2 * scale * _RING + 2 * self.options.margin
         self.define_race(_COUNT, reach, half)
 
     @property
@@ -89,7 +90,7 @@ class Gates(Racing):
         track = draw.openings + 0.0 * offset[..., None, :1]
         self.memory.track = track
         c, s = track[..., 0, 3], track[..., 0, 4]
-        behind = _BEHIND * self.config.scene.scale
+        behind = _BEHIND * self.config.scene.values.scale
         position = track[..., 0, :3] - behind * stack((c, s, 0.0 * c)) + offset
         w = square_root((1.0 + c) / 2)  # the first gate faces left of the ring: c > -0.5
         return self.start(position, stack((w, 0.0 * c, 0.0 * c, s / (2 * w))))

@@ -273,9 +273,10 @@ def check_room(task: Task, reach: float) -> None:
     """
     scene = task.config.scene
     needed = reach + task.vehicle.radius
-    if scene.is_seeded and scene.room < needed:
+    room = scene.values.room
+    if scene.is_seeded and room < needed:
         expected = f"one that leaves {needed:.3g} m about the z axis to {task.config.env_id}"
-        raise InputError(f"scene: expected {expected}, got {scene}, which leaves {scene.room:.3g}")
+        raise InputError(f"scene: expected {expected}, got {scene}, which leaves {room:.3g}")
 
 
 def check_more(name: str, size: float, what: str, least: float) -> None:

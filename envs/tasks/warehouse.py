@@ -8,7 +8,7 @@ import numpy as np
 from ...models import InputError
 from ...models.fields import Limits, NumberOrPair, immutable
 from ...scenes import SceneConfig
-from ...scenes.aisles import AISLE, DEPTH, PASSAGE, ROW, counts
+from ...scenes.aisles import AISLE, DEPTH, PASSAGE, ROW
 from ...sim import Array, Draw, InitialState, parts_of
 from .forest import Forest, distance_of
 from .task import TaskOptions
@@ -69,17 +69,14 @@ class Warehouse(Forest):
     def scene(cls, options: WarehouseOptions) -> SceneConfig:
         """New aisles in each episode."""
         size = ROW - DEPTH + ROW * options.rows, AISLE * options.aisles
-        return SceneConfig(name="aisles", layouts="new", size=size)
+        return SceneConfig(name="aisles", layouts="new", options={"size": size})
 
     def setup(self) -> None:
         """See the class."""
         scene = self.config.scene
         if scene.name != "aisles":
             raise InputError(f"scene: expected aisles with {self.config.env_id}, got {scene}")
-        usual = self.scene(self.options)
-        if not np.allclose(scene.size or 0.0, usual.size or 0.0):
-            raise InputError(f"scene: expected the size of {usual}, got {scene}")
-        rows, aisles = counts(scene)
+        rows, aisles = scene.values.counts
         self.define_way(ROW * rows, AISLE * aisles)
 
     def begin(self, mask: Array, draw: Draw) -> InitialState:
@@ -100,7 +97,7 @@ class Warehouse(Forest):
         x, y, _ = parts_of(position)
         way = distance_of(self._half - x, y)
         last_x, last_y, left = self._half + 0.0 * x, 0.0 * y, 0.0 * x
-        for row in reversed(range(counts(self.config.scene)[0])):
+        for row in reversed(range(self.config.scene.values.counts[0])):
             middle, door = parts_of(self.memory.doors[..., row, :])
             mouth, end = middle - DEPTH / 2, middle + DEPTH / 2
             left = left + distance_of(last_x - end, last_y - door)

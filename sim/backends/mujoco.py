@@ -23,7 +23,7 @@ from ...models.vehicle import (
     owners,
     payload_radius,
 )
-from ...scenes.geoms import NAME, add_solids, geoms_of
+from ...scenes.geoms import HFIELD, NAME, add_fields, add_solids, fields_of, geoms_of
 from ...scenes.solids import Solids
 from ..effects import EffectOptions
 from ..randomize import CENTER, Randomization
@@ -125,6 +125,13 @@ class MujocoWorld(World):
             delete_obstacles(spec)
         fixed = Solids.none() if scenery.varies else scenery.solids(int(scenery.seeds[0]))
         add_solids(spec, fixed, scenery.most)
+        if not scenery.varies:
+            return
+        if not scenery.given and (scenery.solids(0).kinds == HFIELD).any():
+            expected = "a scene with height fields to have given seeds on mujoco, as hills:0-7"
+            raise InputError(f"scene: expected {expected}, got {scenery.scene}")
+        for number, seed in enumerate(scenery.given):
+            add_fields(spec, number, scenery.solids(seed))
 
     def _lay(self, ids: np.ndarray) -> None:
         """Give geoms the layouts of some worlds."""
@@ -135,6 +142,10 @@ class MujocoWorld(World):
             solids = self.scenery.solids(int(seeds[world]))
             for field, rows in geoms_of(solids, self.scenery.most).items():
                 self._batch.expand(field)[world, self._slots] = rows
+            if (solids.kinds == HFIELD).any():
+                which = fields_of(self._batch.model, int(self.scenery.numbers[world]), solids)
+                first = self._slots.start
+                self._batch.expand("geom_dataid")[world, first : first + len(which)] = which
             self._laid[world] = seeds[world]
         self._follow(ids)
 

@@ -32,11 +32,13 @@ def straight(loop: Loop, steps: int) -> None:
 def test_a_config_has_the_wood_of_its_options() -> None:
     config = EnvConfig.from_keywords(FOREST, density=0.2, way=20.0)
     assert config.scene == SceneConfig(
-        name="forest", layouts="new", density=0.2, size=(24.0, 16.0), clear="ends"
+        name="forest",
+        layouts="new",
+        options={"density": 0.2, "size": (24.0, 16.0), "clear": "ends"},
     )
     assert config.vehicle == ("hummingbird",)
     assert config.sensors["depth"]["rows"] == 6
-    assert config.changed(density=0.05).scene.density == 0.05
+    assert config.changed(density=0.05).scene.options["density"] == 0.05
     assert EnvConfig.from_keywords(**config.keywords()) == config
     assert EnvConfig.from_dict(config.to_dict()) == config
     other = EnvConfig.from_keywords(FOREST, scene="warehouse:2", vehicle="crazyflie2")

@@ -41,7 +41,7 @@ def test_a_wide_path_needs_a_wide_scene() -> None:
 
 def test_a_scene_without_options_has_those_of_the_task() -> None:
     of_task = {
-        "Forest": ({"density": 0.2}, "forest:3", "forest:3,density=0.2,size=34x16,clear=ends"),
+        "Forest": ({"density": 0.2}, "forest:3", "forest:3,size=34x16,clear=ends,density=0.2"),
         "Gates": ({"opening": 1.2}, "gates:0-3", "gates:0-3,size=12x12"),
         "Hover": ({}, "forest:3", "forest:3"),
     }
@@ -49,5 +49,21 @@ def test_a_scene_without_options_has_those_of_the_task() -> None:
         config = EnvConfig.from_keywords(f"rotorgram/{name}-v0", scene=given, **options)
         assert str(config.scene) == expected
         assert EnvConfig.from_keywords(**config.keywords()) == config
-    own = "forest:3,density=0.05,size=40x20,clear=ends"
-    assert str(EnvConfig.from_keywords("rotorgram/Forest-v0", scene=own).scene) == own
+
+
+@pytest.mark.parametrize(
+    ("task", "scene"),
+    [("Forest", "forest:3,density=0.05"), ("Forest", "forest:new,size=40x20"),
+     ("Gates", "gates:new,size=16x16")],
+)  # fmt: skip
+def test_a_scene_that_contradicts_the_task_is_refused(task: str, scene: str) -> None:
+    with pytest.raises(InputError, match=f"scene: expected .*, as the task's .*, got {scene}"):
+        EnvConfig.from_keywords(f"rotorgram/{task}-v0", scene=scene)
+
+
+def test_a_change_of_the_task_changes_its_scene() -> None:
+    config = EnvConfig.from_keywords("rotorgram/Forest-v0", scene="forest:3")
+    other = EnvConfig.from_keywords(**config.unseen().keywords()).changed(density=0.05)
+    assert str(other.scene) == "forest:3,size=34x16,clear=ends,density=0.05"
+    whole = {"scene": str(config.scene)}
+    assert EnvConfig.from_keywords("rotorgram/Forest-v0", **whole) == config

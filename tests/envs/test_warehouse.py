@@ -106,5 +106,5 @@ def test_another_scene_is_refused() -> None:
 
 def test_a_hall_of_another_size_is_refused() -> None:
     for size in ("15.9x9.6", "14x9.6", "4x4"):
-        with pytest.raises(InputError, match=r"scene: expected the size of aisles:new,size=12x7"):
+        with pytest.raises(InputError, match=r"scene: expected aisles:new,size=12x7.19"):
             task_of("rotorgram/Warehouse-v0", scene=f"aisles:new,size={size}")

@@ -4,6 +4,7 @@ import sys
 from collections import Counter
 from contextlib import closing
 from pathlib import Path
+from typing import Annotated
 
 import gymnasium as gym
 import numpy as np
@@ -12,10 +13,12 @@ import rotorgram.envs  # noqa: F401
 from find_path import find_path
 from rotorgram.envs.config import EnvConfig
 from rotorgram.models import InputError
+from rotorgram.models.fields import Limits, immutable
 from rotorgram.scenes import (
     SCENES,
     Draft,
     SceneConfig,
+    SceneOptions,
     SceneType,
     Solids,
     register,
@@ -93,7 +96,8 @@ def test_a_maze_has_the_stated_walls(size: tuple[float, float], cells: tuple[int
     closed = sides - (columns * rows - 1)
     counts = []
     for seed in range(20):
-        scene = SceneConfig(name="maze", size=size, clear="ends", seeds=(seed,))
+        options = {"size": size, "clear": "ends"}
+        scene = SceneConfig(name="maze", options=options, seeds=(seed,))
         names = Solids.of_scene(scene).names
         counts.append(sum(name.startswith("maze/wall_") for name in names))
     assert 0.9 * closed - 10 < np.mean(counts) < 0.9 * closed
@@ -101,18 +105,18 @@ def test_a_maze_has_the_stated_walls(size: tuple[float, float], cells: tuple[int
 
 
 def test_a_forest_has_the_stated_density() -> None:
-    scene = SceneConfig(name="forest", density=0.1, size=(40.0, 30.0), clear="ends")
+    scene = SceneConfig.parse("forest,density=0.1,size=40x30,clear=ends")
     names = Solids.of_layout(scene, 5).names
     assert sum(name.endswith("/trunk") for name in names) == 0.1 * 40 * 30
 
 
 def test_what_a_maze_refuses() -> None:
-    with pytest.raises(InputError, match=r"density with the scene forest alone, got maze"):
+    with pytest.raises(InputError, match=r"^scene: expected some of size, clear, got 'density'"):
         SceneConfig.parse("maze:1,density=0.1")
     with pytest.raises(InputError, match=r"^scene: expected at most 10000 parts, got 17694"):
         SceneConfig.parse("maze:1,size=400x400")
-    with pytest.raises(InputError, match=r"^scene: expected a size of 24 m or more, or clear="):
-        SceneConfig.parse("maze:1,size=12x12")
+    with pytest.raises(InputError, match=r"^scene: expected a size of 30 m or more, or clear="):
+        SceneConfig.parse("maze:1,size=24x24")
 
 
 # ---- a scene of one's own
@@ -161,6 +165,52 @@ def test_a_scene_of_ones_own_is_one_file(tmp_path: Path, monkeypatch: pytest.Mon
         sys.modules.pop("my_posts", None)
 
 
+@immutable
+class RowOptions(SceneOptions):
+    """Of a row of posts."""
+
+    count: Annotated[int, Limits(1, 100, whole=True)] = 3
+    spacing: Annotated[float, Limits(0.5, 10.0, "m")] = 2.0
+
+    @property
+    def most(self) -> int:
+        """One for each."""
+        return self.count
+
+
+def row(draft: Draft) -> None:
+    for i in range(draft.options.count):
+        place = (9.0 + draft.options.spacing * i, 0.0, 1.0)
+        draft.add(f"post_{i}/pole", "cylinder", (0.2, 1, 0), place, "steel")
+
+
+def test_a_scene_of_ones_own_has_options_of_its_own() -> None:
+    register("row", SceneType(draw=row, options=RowOptions))
+    try:
+        scene = SceneConfig.parse("row:new,count=7,spacing=1.5")
+        assert str(scene) == "row:new,count=7,spacing=1.5"
+        assert scene.values.count == 7
+        assert len(Solids.of_layout(scene, 4)) == 7
+        assert len(Solids.of_scene("row")) == 3
+        assert Solids.of_scene("row:2,spacing=4").centers[1, 0] == 13.0
+        config = EnvConfig(env_id="rotorgram/Hover-v0", scene="row:1,count=5")
+        assert EnvConfig.from_dict(config.to_dict()) == config
+        with pytest.raises(
+            InputError, match=r"^scene.count: expected a whole number from 1 to 100"
+        ):
+            SceneConfig.parse("row:1,count=200")
+        with pytest.raises(
+            InputError, match=r"^scene: expected some of count, spacing, got 'size'"
+        ):
+            SceneConfig.parse("row:1,size=3x3")
+        with pytest.raises(
+            InputError, match=r"^scene: expected no options with warehouse, got size"
+        ):
+            SceneConfig.parse("warehouse:1,size=3x3")
+    finally:
+        SCENES.pop("row")
+
+
 def test_wrong_scenes_of_ones_own() -> None:
     def too_many(draft: Draft) -> None:
         for i in range(3):
@@ -172,7 +222,18 @@ def test_wrong_scenes_of_ones_own() -> None:
         register("plain", SceneType(draw=too_many))
     with pytest.raises(InputError, match=r"^scene: expected mine to have a function that draws"):
         register("mine", SceneType())
-    register("mine", SceneType(draw=too_many, most=lambda _: 2))
+
+    class Two(SceneOptions):
+        most = 2
+
+    def wrong(draft: Draft) -> None:
+        draft.add("ball_0/ball", "sphere", (-1, 0, 0), (0, 0, 9), "")
+        draft.add("ball_1/ball", "sphere", (1, 0, 0), (0, float("nan"), 9), "")
+
+    register("mine", SceneType(draw=wrong))
+    with pytest.raises(InputError, match=r"^scene: expected sizes and places .* others in mine"):
+        Solids.of_scene("mine:2")
+    register("mine", SceneType(draw=too_many, options=Two))
     try:
         with pytest.raises(InputError, match=r"^scene: expected at most 2 parts of mine, got 3"):
             Solids.of_scene("mine:1")

@@ -11,6 +11,7 @@ import mujoco
 import numpy as np
 import pytest
 import rotorgram.envs  # noqa: F401
+from commands import Capsys, refused
 from rotorgram.envs.config import EnvConfig, read_keywords
 from rotorgram.models import InputError
 from rotorgram.models.vehicle import Vehicle
@@ -133,7 +134,7 @@ def test_content_travels_with_the_config_and_files_do_not(scene: str) -> None:
     assert (Solids.of_scene(there.scene).table == solids.table).all()
     copy = SceneConfig.parse(path_of(there.scene))  # as commands name it where the file is not
     assert (Solids.of_scene(copy).table == solids.table).all()
-    with pytest.raises(InputError, match=rf"^scene: expected a file {scene}, got none"):
+    with pytest.raises(InputError, match=rf"^scene: {scene}: expected a file, got none"):
         EnvConfig(env_id="rotorgram/Hover-v0", scene=scene).resolve()
 
 
@@ -198,6 +199,7 @@ def test_hostile_toml(tmp_path: Path, content: str | bytes, sentence: str) -> No
 
 MANY = "<replicate count='10000000' offset='1 0 0'><geom size='1'/></replicate>"
 NESTED = "<replicate count='1000'><replicate count='1000'><geom size='1'/></replicate></replicate>"
+MESH = "<asset><mesh name='m' vertex='0 0 0 1 0 0 0 1 0 0 0 1'/></asset>"
 FIELD = "<asset><hfield name='h' nrow='{0}' ncol='{0}' size='1 1 1 1'/></asset>"
 
 
@@ -208,8 +210,8 @@ FIELD = "<asset><hfield name='h' nrow='{0}' ncol='{0}' size='1 1 1 1'/></asset>"
         (f"<worldbody>{NESTED}</worldbody>", r"file: expected at most 10000 elements, got .*"),
         (FIELD.format(30_000), r"file: expected .* of at most .*"),
         (
-            FIELD.format(4) + "<worldbody><geom name='h' type='hfield' hfield='h'/></worldbody>",
-            r"expected sphere, .*, ellipsoid, got h, a hfield",
+            MESH + "<worldbody><geom name='h' type='mesh' mesh='m'/></worldbody>",
+            r"expected sphere, .*, ellipsoid, got h, a mesh",
         ),
         (
             "<worldbody><body><joint/><geom name='door' size='1'/></body></worldbody>",
@@ -239,8 +241,10 @@ def test_hostile_mjcf(tmp_path: Path, content: str, sentence: str) -> None:
 def test_what_is_no_file(tmp_path: Path) -> None:
     folder = tmp_path / "world.toml"
     folder.mkdir()
-    with pytest.raises(InputError, match=r"^scene: expected a file .*, got another thing"):
+    with pytest.raises(InputError, match=r"^scene: .*: expected a file, got another thing"):
         Solids.of_scene(str(folder))
+    with pytest.raises(InputError, match=r"^scene: cannot read .*: File name too long"):
+        Solids.of_scene("x" * 5000 + ".toml")
     with pytest.raises(InputError, match=r"^scene: expected content of a file alone, got .*forest"):
         SceneConfig(name="forest", content=TOML)
     with pytest.raises(InputError, match=r"^obstacle: expected a TOML file, got a text: "):
@@ -249,12 +253,38 @@ def test_what_is_no_file(tmp_path: Path) -> None:
         SceneConfig(name="world.toml", seeds=(3,))
 
 
+def test_a_file_without_obstacles_is_read_once(tmp_path: Path) -> None:
+    scene = SceneConfig.parse(written(tmp_path, "obstacle = []\n", "none.toml")).embedded()
+    (tmp_path / "none.toml").unlink()
+    assert scene.content
+    assert len(Solids.of_scene(scene.embedded())) == 1
+
+
+def test_serve_refuses_a_file_that_is_missing(capsys: Capsys) -> None:
+    sentence = "scene: nowhere.toml: expected a file, got none"
+    assert sentence in refused(capsys, "serve", "pid", "--scene", "nowhere.toml")
+
+
+def test_what_mjcf_has_beside_geoms_is_left_out(tmp_path: Path) -> None:
+    content = """<mujoco><worldbody>
+      <body name="door"><joint name="hinge"/><site name="s"/>
+      <geom name="g" size="1" contype="0" conaffinity="0"/></body>
+      <site name="t"/><geom name="wall" type="box" size="1 1 1" pos="5 0 1"/>
+    </worldbody>
+    <contact><pair geom1="g" geom2="wall"/></contact>
+    <tendon><spatial name="rope"><site site="s"/><geom geom="g"/><site site="t"/></spatial></tendon>
+    <actuator><motor tendon="rope"/></actuator>
+    <sensor><tendonpos tendon="rope"/></sensor></mujoco>"""
+    scene = written(tmp_path, content, "door.xml")
+    assert Solids.of_scene(scene).standing().distance((3.0, 0.0, 1.0)) == pytest.approx(1.0)
+
+
 @pytest.mark.parametrize("ending", ["toml", "xml"])
 def test_the_file_of_the_page(tmp_path: Path, ending: str) -> None:
     page = (Path(__file__).parents[2] / "docs" / "solids.md").read_text("utf-8")
     block = page.partition(f"```{ending}\n")[2].partition("```")[0]
     scene = written(tmp_path, block, f"my_world.{ending}")
-    counts = {"toml": 4, "xml": 6}
+    counts = {"toml": 5, "xml": 6}
     assert len(Solids.of_layout(SceneConfig.parse(scene), 0)) == counts[ending]
 
 

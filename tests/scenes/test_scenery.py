@@ -16,7 +16,7 @@ from rotorgram.rendering.cameras import Cameras
 from rotorgram.scenes import SCENES, build_scene, parse_scene, seeded_scenes
 
 scenes = pytest.mark.parametrize("scene", seeded_scenes())
-OPEN_SCENES = [name for name in seeded_scenes() if parse_scene(name).room]
+OPEN_SCENES = [name for name in seeded_scenes() if parse_scene(name).values.room]
 
 
 def ours(model: mujoco.MjModel, scene: str) -> list[str]:
@@ -53,7 +53,9 @@ def test_the_flying_room_is_free(scene: str, seed: int) -> None:
     mujoco.mj_forward(model, data)
     for name in ours(model, scene):
         geom = model.geom(name).id
-        if model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_PLANE or "/gate_" in name:
+        kind = model.geom_type[geom]
+        is_land = kind == mujoco.mjtGeom.mjGEOM_PLANE or kind == mujoco.mjtGeom.mjGEOM_HFIELD
+        if is_land or "/gate_" in name:
             continue
         rotation = data.geom_xmat[geom].reshape(3, 3)
         centre = data.geom_xpos[geom] + rotation @ model.geom_aabb[geom, :3]
@@ -111,7 +113,8 @@ def test_it_is_looked_at_and_never_felt(scene: str, discard: bool) -> None:
     assert fly(model) == (flown, contacts)
     for count in ("nbody", "njnt", "nv", "nu", "nsensor", "nsite", "nmocap", "neq", "npair"):
         assert getattr(model, count) == getattr(alone, count), count
-    assert (model.nmesh, model.nhfield, model.nflex, model.nskin) == (0, 0, 0, 0)
+    assert (model.nmesh, model.nflex, model.nskin) == (0, 0, 0)
+    assert model.nhfield == (scene == "hills")
     assert model.body_mass.tolist() == alone.body_mass.tolist()
     assert model.body_inertia.tolist() == alone.body_inertia.tolist()
     if discard:

@@ -171,18 +171,16 @@ def test_what_is_refused() -> None:
         scene.field((0, 0, 0), (1, 1, 1), 0.001)
     with pytest.raises(InputError, match=r"^low, high: expected two corners, each below the other"):
         scene.field((0, 0, 2), (1, 1, 1), 0.1)
-    with pytest.raises(
-        InputError, match=r"^scene: expected sphere, .* or ellipsoid, got it, a hfi"
-    ):
-        _height_field()
+    with pytest.raises(InputError, match=r"^scene: expected .* or ellipsoid, got it, a mesh"):
+        _mesh()
     with pytest.raises(InputError, match=r"^scene: half a side of it: expected .* got 20000"):
         solids("box", (2e4, 1.0, 1.0))
     with pytest.raises(InputError, match=r"^scene: expected solids within 10000 m of the origin"):
         solids("box", (1.0, 1.0, 1.0), pos=(2e4, 0.0, 0.0))
 
 
-def _height_field() -> Solids:
+def _mesh() -> Solids:
     spec = MjSpec()
-    spec.add_hfield(name="h", size=(1, 1, 1, 1), nrow=2, ncol=2, userdata=[0, 1, 0, 1])
-    spec.worldbody.add_geom(name="it", type=mjtGeom.mjGEOM_HFIELD, hfieldname="h")
+    spec.add_mesh(name="m", uservert=[0, 0, 0, 1, 0, 0, 0, 1, 0, 0, 0, 1])
+    spec.worldbody.add_geom(name="it", type=mjtGeom.mjGEOM_MESH, meshname="m")
     return Solids.of_model(spec.compile())

@@ -371,10 +371,11 @@ def test_obstacles_of_a_file_are_solid_or_refused_by_name(tmp_path: Path) -> Non
         assert not world.state.touching.any()
         begin(world, position=(0.9, 0.0, 2.0))
         assert world.state.touching.all()
-    rough = 'type="hfield" hfield="hill" pos="9 0 0"/></worldbody>'
-    hill = '<asset><hfield name="hill" nrow="2" ncol="2" size="1 1 1 1"/></asset><worldbody>'
+    rough = 'type="mesh" mesh="hill" pos="9 0 0"/></worldbody>'
+    corners = '<mesh name="hill" vertex="0 0 0 1 0 0 0 1 0 0 0 1"/>'
+    hill = f"<asset>{corners}</asset><worldbody>"
     file.write_text(wood.replace("<worldbody>", hill, 1).replace(tree[6:], 'name="rock" ' + rough))
-    with pytest.raises(InputError, match=r"^scene: expected sphere, .* got rock, a hfield"):
+    with pytest.raises(InputError, match=r"^scene: expected sphere, .* got rock, a mesh"):
         arrays(Vehicle.load(file))
     seen = tree.replace("/>", ' contype="0" conaffinity="0"/>')  # which nothing touches
     wood = text.replace("</worldbody>", seen, 1)

@@ -1,0 +1,112 @@
+"""Height fields: ground of heights over a grid, from its corner with the least x and y on.
+
+Frame: x along the columns, y along the rows, z up, m.
+"""
+
+import math
+from typing import TYPE_CHECKING, Annotated
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..models.errors import InputError
+from ..models.fields import Limits, immutable
+from .options import CLEARANCE, SceneOptions, Size
+
+if TYPE_CHECKING:
+    from .generators import Draft
+
+Array = NDArray[np.float64]
+
+MAX_POINTS = 1 << 16
+"""Most heights of a field."""
+CELL = 1.6  # m: the largest scene has no more than so many heights
+_AREA = 250.0  # m² for each hill
+_RADII = (6.0, 16.0)  # m
+_BOULDERS = 120
+_SUNK = 1.0  # m: how deep what is level lies below the ground, where nothing touches it
+_DEPTH = 2.0  # m: how deep the field is
+_SLOPE = 8.0  # m: over which hills rise from the clear space, and sink to the border
+
+
+@immutable
+class HillsOptions(SceneOptions):
+    """Options of the scene `hills`."""
+
+    size: Size = (90.0, 90.0)
+    height: Annotated[float, Limits(0.5, 20.0, "m")] = 8.0
+    """Of the highest hill."""
+
+    def check(self) -> None:
+        """As `SceneOptions.check`."""
+        if min(self.size) < 4 * CLEARANCE:
+            expected = f"sides of at least {4 * CLEARANCE:g} m"
+            raise InputError(f"scene: expected {expected}, got {min(self.size):g} m")
+
+
+def hills(land: "Draft") -> None:
+    """Round hills about a level middle, in one height field, and boulders on them."""
+    options: HillsOptions = land.options
+    land.add("ground/floor", "plane", (150, 150, 1), (0, 0, 0), "grass")
+    half = np.array(options.size) / 2
+    columns, rows = np.ceil(2 * half / CELL).astype(int) + 1
+    x = np.linspace(-half[0], half[0], columns)
+    y = np.linspace(-half[1], half[1], rows)[:, None]
+    heights = np.zeros((rows, columns))
+    for _ in range(round(4 * half.prod() / _AREA)):
+        place = land.rng.uniform(-half, half)
+        radius = land.uniform(*_RADII)
+        tall = land.uniform(0.3, 1.0)
+        square = ((x - place[0]) ** 2 + (y - place[1]) ** 2) / (radius * radius)
+        heights = np.maximum(heights, tall * np.maximum(1 - square, 0.0) ** 2)
+    middle = np.sqrt(x * x + y * y) - math.sqrt(2) * CLEARANCE
+    border = np.minimum(half[0] - abs(x), half[1] - abs(y))
+    heights *= np.clip(np.minimum(middle, border) / _SLOPE, 0.0, 1.0)
+    heights *= (options.height + _SUNK) / max(
+        float(heights.max()), 1e-6
+    )  # all may lie in the middle
+    heights -= _SUNK
+    land.add_heights("hills_0/ground", half, heights, _DEPTH, "slope")
+    far = float(half.min())
+    for i in range(_BOULDERS):
+        radius = land.uniform(0.4, 1.2)
+        place = np.array(land.around(radius, far))
+        column, row = ((place + half) / (2 * half) * (columns - 1, rows - 1)).astype(int)
+        center = (*place, max(0.0, heights[row, column]) + 0.2 * radius)
+        land.add(f"boulder_{i}/stone", "sphere", (radius, 0, 0), center, "stone")
+
+
+def centered(heights: Array, depth: float) -> tuple[float, Array]:
+    """Middle between the deepest point of a field, which is `depth` below 0, and the highest; and
+    heights above it.
+    """
+    middle = (float(heights.max()) - depth) / 2
+    return middle, heights - middle
+
+
+def least_of(grid: Array | None) -> float:
+    """The least height of a field, 0 of another solid."""
+    return 0.0 if grid is None else float(grid.min())
+
+
+class Heights:
+    """Rule of the heights of a field: rows of numbers, m."""
+
+    expected = f"2 or more rows of as many numbers from -1000 to 1000 m, {MAX_POINTS} at most"
+
+    def read(self, value: object) -> tuple[tuple[float, ...], ...]:
+        """As `fields.Rule`."""
+        if isinstance(value, tuple) and not value:
+            return ()
+        heights = np.array(value, float)
+        if heights.ndim != 2 or not (abs(heights) <= 1e3).all():
+            raise ValueError
+        check_points(len(heights), heights.shape[1], "heights")
+        return tuple(map(tuple, heights.tolist()))
+
+
+def check_points(rows: int, columns: int, where: str) -> None:
+    """Refuse a field of a wrong size. Raises `InputError`."""
+    if min(rows, columns) < 2 or rows * columns > MAX_POINTS:
+        expected = f"2 or more rows and columns, and at most {MAX_POINTS} heights"
+        raise InputError(f"{where}: expected {expected}, got {rows} x {columns}")
