@@ -1,6 +1,7 @@
 """Advantage Actor-Critic: the paper's Algorithm 2, Equation 3."""
 
 import math
+from functools import cached_property
 from typing import Annotated
 
 import numpy as np
@@ -8,7 +9,7 @@ import numpy as np
 from ..models.fields import Limits, immutable
 from .config import RolloutConfig, Share
 from .episodes import Mask
-from .layers import Floats
+from .layers import Floats, Weights
 from .learner import Learner
 from .memory import Sequences
 from .rollouts import Collector, Numbers, Rollout, advantages
@@ -62,8 +63,7 @@ class A2C(Learner):
         values = judged.astype(np.float32)
         targets = values + advantage
         self.terms = {"values": rollout.rows(values), "targets": rollout.rows(targets)}
-        inputs = self.inputs(rollout.observations, seen)
-        columns = [inputs, rollout.actions, advantage, targets]
+        columns = [seen, rollout.actions, advantage, targets]
         if self.config.memory:
             return columns
         return [rollout.rows(column) for column in columns]
@@ -107,15 +107,13 @@ class A2C(Learner):
             found[...] = 0.0
             found[..., sequences.kept.ravel()] = slopes
         self._both.backward(found)
+        by_weights = self.weights.slopes
+        by_weights *= self._learned
         return float(gains.sum()) / count, entropy, float(errors.dot(errors)) / count
 
     def objective(self, log_probability: Floats, advantage: Floats) -> tuple[Floats, Floats]:
         """The gain of each transition, and its derivative by log P, all of shape (B,)."""
         return log_probability * advantage, advantage
-
-    def inputs(self, observations: Floats, seen: Floats) -> Floats:
-        """Inputs of actor and critic, (T, N, n), the same for both; or of each, (T, N, m, 2)."""
-        return observations
 
     def advantages(self, rollout: Rollout) -> tuple[Numbers, Numbers, Floats]:
         """A_t and V(s_t) of every row, shape (T, N), and the inputs of the critic for them."""
@@ -149,9 +147,24 @@ class A2C(Learner):
     def seen(self, observations: Floats, flying: Mask) -> Floats:
         """Inputs of the critic, shape (T, N, m), from observations (T, N, n): here the same.
 
-        Of drones that are not `flying`, bool, shape (T, N), another drone may not learn.
+        The first of them are the actor's. Of drones that are not `flying`, bool, shape (T, N),
+        another drone may not learn.
         """
         return observations
+
+    @cached_property
+    def _learned(self) -> Floats:
+        """1 for each weight that actor or critic has, 0 for those that both skip, shape (P,).
+
+        In an update both see the inputs of the critic: weights of inputs that the actor does not
+        have stay 0.
+        """
+        shapes = {name: array.shape for name, array in self.weights.arrays.items()}
+        learned = Weights.zeros(shapes)
+        for number, own in enumerate((self._actor.shapes, self._critic.shapes)):
+            for array in learned.of_one(number, own).arrays.values():
+                array[...] = 1.0
+        return learned.values
 
     def _values(self, seen: Floats, sequences: Sequences | None) -> Numbers:
         """V(s), shape (...), of inputs of the critic, shape (..., m)."""

@@ -33,7 +33,8 @@ class APG(Learner):
     """Climb the discounted rewards of short flights, by their derivative.
 
     A flight begins where the last one ended. An action counts with all that follows from it until
-    the flight or the episode ends, through the policy's later actions too.
+    the flight or the episode ends, through the policy's later actions too. What rays and pictures
+    show counts as given, and privileged arrays, which are for a critic, are skipped.
     """
 
     config: APGConfig
@@ -83,7 +84,7 @@ class APG(Learner):
         ended = np.asarray(worlds.all(axis=2))
         ended[-1] = True
         slopes = np.zeros_like(rollout.actions)
-        by_observations = np.zeros_like(rollout.observations[0])
+        by_observations = np.zeros((self._drones, network.inputs), np.float32)
         for step in reversed(range(steps)):
             drawn = rollout.actions[step]
             sent = actions.to_envs(drawn)

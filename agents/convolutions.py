@@ -1,7 +1,8 @@
 """Convolutions over images and rings: which array needs them follows from the axes of its spec.
 
-An image has the axes `row` and `column`; beyond its edges it goes on as at the edge. A lidar has
-`ring` and `azimuth`: each ring is a channel, and the azimuths close a circle.
+An image has the axes `row` and `column`, and a picture `channel` too; beyond its edges it goes on
+as at the edge. A lidar has `ring` and `azimuth`: each ring is a channel, and the azimuths close a
+circle.
 """
 
 import math
@@ -10,7 +11,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from ..envs.spec import IMAGE, RINGS, ArraySpec
+from ..envs.spec import IMAGE, PICTURE, RINGS, ArraySpec
 from .layers import Affine, Chain, Floats, Layer, sized
 
 Places = NDArray[np.int64]
@@ -125,15 +126,18 @@ def convolutions(
     Windows have three places along each axis, around every second place.
     """
     circle = array.axes == RINGS
-    channels = array.shape[0] if circle else 1
-    sizes = array.shape[1:] if circle else array.shape
+    channels = array.shape[0] if circle else math.prod(array.shape[2:])
+    sizes = array.shape[1:] if circle else array.shape[:2]
+    # Steps from channel to channel, and from place to place.
+    apart, step = (math.prod(sizes), 1) if circle else (1, channels)
     layers: list[Layer] = []
     for count in filters:
-        windows = _windows(sizes, circle)
-        starts = first + math.prod(sizes) * np.arange(channels)
+        windows = step * _windows(sizes, circle)
+        starts = first + apart * np.arange(channels)
         places = starts[:, None, None] + windows
         layers += [Convolution(inputs, places.reshape(-1, windows.shape[1]), count), activation()]
         sizes = tuple(-(-size // 2) for size in sizes)
+        apart, step = math.prod(sizes), 1
         first = 0
         channels = count
         inputs = count * math.prod(sizes)
@@ -159,4 +163,4 @@ def slices(sizes: Sequence[int]) -> list[slice]:
 
 def is_grid(array: ArraySpec) -> bool:
     """Whether convolutions can read an array."""
-    return array.axes in (IMAGE, RINGS)
+    return array.axes in (IMAGE, PICTURE, RINGS)

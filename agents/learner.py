@@ -51,7 +51,7 @@ class Learner:
         weights_seed, self._rng = seeds_of(seed)
         self._actor = actor = NetworkPolicy(log.spec, config)
         copies = len(log.spec.agents) if self.central else 1
-        seen = copies * log.spec.observation
+        seen = copies * log.spec.observation if self.has_critic else actor.spec.observation
         self._both = make_network(seen, actor.actions.outputs, config)
         count = 2 if self.has_critic else 1
         shapes = {**self._both.shapes, **actor.head.shapes}

@@ -26,9 +26,3 @@ class MAPPO(PPO):
         there = worlds * flying.reshape(steps, -1, count, 1)
         others = [np.roll(there, -next_one, axis=2) for next_one in range(1, count)]
         return np.concatenate([worlds, *others], axis=-1).reshape(steps, rows, -1)
-
-    def inputs(self, observations: Floats, seen: Floats) -> Floats:
-        both = np.zeros((*seen.shape, 2), np.float32)
-        both[..., : observations.shape[-1], 0] = observations
-        both[..., 1] = seen
-        return both

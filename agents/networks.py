@@ -25,6 +25,7 @@ class Network(Chain):
     Distances come in as nearness; then come the encoder and the memory, if it has them.
 
     Attributes:
+        inputs: Numbers that it sees, n.
         memory: The layer that remembers, if there is one.
     """
 
@@ -33,14 +34,16 @@ class Network(Chain):
 
     def __init__(self, arrays: Sequence[ArraySpec], outputs: int, config: Config) -> None:
         """The inputs are these arrays, one after the other."""
-        inputs = sum(array.size for array in arrays)
+        self.inputs = inputs = sum(array.size for array in arrays)
         layers: list[Layer] = []
         if distances := distances_in(arrays):
             layers.append(Nearness(distances))
         if self.convolves:
             if not any(map(is_grid, arrays)):
                 names = ", ".join(array.name for array in arrays)
-                raise InputError(f"network: expected rays in rows or rings for cnn, got {names}")
+                raise InputError(
+                    f"network: expected rays in rows or rings, or pictures, for cnn, got {names}"
+                )
             encoder = Encoder(arrays, config.filters, _ACTIVATIONS[config.activation])
             inputs = encoder.outputs
             layers.append(encoder)
@@ -56,14 +59,14 @@ class Network(Chain):
         """The last layers, which allocate nothing yet."""
 
     def forward(self, inputs: Floats, sequences: Sequences | None = None) -> Floats:
-        """The outputs; the inputs stay as they are.
+        """The outputs; the inputs stay as they are. Of more than n, it sees the first.
 
         With a memory the B rows are those of `sequences`, one time after the other. Without these
         they are the next rows of B sequences that the memory itself follows.
         """
-        *lead, rows, count = inputs.shape
-        self._inputs = sized(self._inputs, *lead, 1 + rows, count)
-        self._inputs[..., 1:, :] = inputs
+        *lead, _, count = inputs.shape
+        self._inputs = sized(self._inputs, *lead, 1 + self.inputs, count)
+        self._inputs[..., 1:, :] = inputs[..., : self.inputs, :]
         if self.memory:
             self.memory.sequences = sequences
         return super().forward(self._inputs)[..., 1:, :]

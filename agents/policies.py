@@ -99,6 +99,7 @@ class NetworkPolicy(Module):
     Where the learner binds it to its weights, it is the policy that learns; a copy of it does not.
 
     Attributes:
+        spec: What it sees: of an env, without privileged arrays.
         network: From observations to the mean of the action, or to the logits of the choices.
         memory: What the network remembers of the episode, if it has a memory.
         head: Distribution of the actions.
@@ -107,7 +108,7 @@ class NetworkPolicy(Module):
     """
 
     def __init__(self, spec: EnvSpec, config: Config) -> None:
-        self.spec = spec
+        self.spec = spec = spec.for_actor()
         self.actions = ActionMap(spec.action)
         outputs = self.actions.outputs
         self.network = make_network(spec.observation, outputs, config)

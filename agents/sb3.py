@@ -157,6 +157,8 @@ class SB3Agent:
         if config.network != "mlp" or config.memory:
             got = f"{config.network!r} with a memory of {config.memory}"
             raise InputError(f"network: expected mlp without memory with SB3, got {got}")
+        if log.spec != log.spec.for_actor():
+            raise InputError("sb3: expected no privileged arrays, which SB3's actor would see too")
         if distances_in(log.spec.observation):
             raise InputError(
                 "sb3: expected observations without distances of rays, which our own agents "

@@ -41,7 +41,8 @@ class VPG(Learner):
     """Raise the log-probability of every action by the return that followed it.
 
     The gradient of Equation 2, R_t · grad log P(a_t | s_t), averaged over the steps of an update.
-    Algorithm 1 prints the update without R; Equation 2 has it, as we do.
+    Algorithm 1 prints the update without R; Equation 2 has it, as we do. Privileged arrays of an
+    observation are for a critic, and skipped.
     """
 
     config: VPGConfig

@@ -1,6 +1,6 @@
 """Derivatives of a compiled step: from those by its results to those by what it began with."""
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -8,8 +8,18 @@ from ..sim.compile import Program, lift, read
 from ..sim.compile.adjoint import adjoints
 from ..sim.compile.layout import Layout, Memory, fields_of
 from ..sim.compile.llvm import Region, compiled
+from ..sim.scenery import Frozen
 from ..sim.state import Array, ByName
 from .loop import Loop
+
+
+class Before(NamedTuple):
+    """What a derivative needs from before a step."""
+
+    memory: Memory
+    """The machine's."""
+    scenery: Frozen
+    """What stood there."""
 
 
 class Derivative:
@@ -18,6 +28,10 @@ class Derivative:
     A loss depends on the rewards and observations of a flight. `back` takes its derivatives from
     the end of a step to its beginning: call it for each step, the last one first. The derivatives
     by the state stay here from call to call.
+
+    What rays and pictures show is a constant, and so is whether a craft touches: the derivative of
+    a distance along a ray, through the craft's own motion, has no bound at an edge. The distance to
+    the nearest solid has one.
 
     Args:
         loop: A loop of one world whose episode has begun.
@@ -32,6 +46,7 @@ class Derivative:
         after = _flown(loop, before)
         ended = read(program, "ended", np.dtype(bool), (1,))
         arrays: ByName = {"sent": before["sent"], "ended": ended}
+        arrays |= {name: before[name] for name in loop.world.scenery.shared()}
         outputs: list[Any] = []
         inputs: list[Any] = []
         places = []
@@ -57,7 +72,7 @@ class Derivative:
 
     def back(
         self,
-        before: Memory,
+        before: Before,
         sent: Array,
         by_reward: Array,
         by_observation: Array,
@@ -66,27 +81,33 @@ class Derivative:
         """Derivatives by the actions of a step, float32, shape (W A, k).
 
         Args:
-            before: The machine's memory before the step.
+            before: Of the machine's tape.
             sent: The actions, shape (W A, k).
             by_reward: Derivatives by the rewards, shape (W A,).
-            by_observation: Those by the observations after the step, flat, shape (W A, n).
+            by_observation: Those by what an actor observes after the step, flat, shape (W A, n).
             ended: Whether the loss depends on nothing after the step, bool, shape (W,). Then the
                 derivatives by state and observations do not count.
         """
         memory = self._memory
+        for name, values in before.scenery.shared.items():
+            memory.put(name, values)
         memory.put("sent", sent)
         memory.put("ended", ended)
         memory.put("by/reward", by_reward)
         memory.put("by/observation", by_observation)
-        self._run(memory.blocks, before.address, memory.address, None)
+        self._run(memory.blocks, before.memory.address, memory.address, None)
         return memory.get("by/sent").reshape(sent.shape)
 
 
 def _variables(program: Program, loop: Loop, state: Layout) -> ByName:
     """Variables of a state, which becomes the loop's, and of actions."""
     arrays: ByName = {}
-    for name, (dtype, shape) in state.fields.items():
+    scenery = loop.world.scenery
+    shared = fields_of(scenery.shared())
+    for name, (dtype, shape) in {**state.fields, **shared}.items():
         arrays[name] = read(program, name, dtype, (1, *shape))
+    for name in shared:
+        setattr(scenery, name, arrays[name])
     sent = loop.record.sent
     loop.put(arrays)
     arrays["sent"] = read(program, "sent", sent.dtype, sent.shape)
@@ -104,8 +125,9 @@ def _flown(loop: Loop, before: ByName) -> ByName:
     after: ByName = loop.state()
     after["reward"] = record.reward
     parts = []
-    for array in loop.spec.observation:
-        values = record.observations[array.name]
+    for array in loop.spec.for_actor().observation:
+        nothing = np.zeros((*record.shape, array.size))
+        values = record.observations.get(array.name, nothing)
         parts.append(values.reshape(*record.shape, -1).astype(np.float32))
     after["observation"] = np.concatenate(parts, axis=-1)
     return after

@@ -91,6 +91,7 @@ class Loop:
         self._closed = False
         self._told: Told | None = None
         self._content: Content | None = None
+        self.observations: ByName
         self._take()
 
     def prepare(self) -> None:
@@ -192,10 +193,12 @@ class Loop:
         return self._world.parameters.get("observation_delay", 0 * self._record.steps)
 
     def _observe(self, late: Array) -> None:
-        """Add what instruments read to the observations."""
+        """Add what instruments read to the observations, in the order of the spec."""
+        seen = self.observations
         for instrument in self.instruments:
             for name, values in instrument.observed(late).items():
-                self.observations[name] = np.array(values).reshape(-1, *values.shape[2:])
+                seen[name] = np.array(values).reshape(-1, *values.shape[2:])
+        self.observations = {array.name: seen[array.name] for array in self.spec.observation}
 
     def snapshot(self) -> Snapshot:
         """Copies of all arrays that a later step depends on, by name.

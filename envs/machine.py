@@ -21,7 +21,7 @@ from ..sim.snapshots import Arrays, Snapshot, joined, part_of
 from ..sim.state import ByName
 from ..sim.world import Call
 from .autoreset import Seeds, Told
-from .derivative import Derivative
+from .derivative import Before, Derivative
 from .loop import Loop
 from .stages.record import Mask, Record
 from .telemetry import telemetry_of
@@ -34,8 +34,6 @@ A step whose physics is array code is the last alone."""
 _PHYSICS = "physics/"
 _MASKS = ("flown", "begun", "active")
 _ENDS = ("terminated", "truncated", "done", "out", "waiting")
-_LAYOUT = "layout"
-_OPENINGS = "openings"
 _SEEN = "seen/"
 _TOLD = "told/"
 _TERM = "told/reward_"
@@ -57,7 +55,7 @@ class Machine:
 
     Attributes:
         is_whole: Whether a step is code as a whole, and has a derivative.
-        tape: Unless it is None, gets the memory from before each flown step.
+        tape: Unless it is None, gets what a derivative needs from before each flown step.
 
     Raises:
         Untraceable: A stage cannot be compiled.
@@ -71,7 +69,7 @@ class Machine:
         ours = loop.world
         ours.outer = seen = ours.told()
         world.asked = ours.asked
-        self.tape: list[Memory] | None = None
+        self.tape: list[Before] | None = None
         state = loop.state()
         sent = loop.record.sent
         width = min(widest(), max(2, 1 << (worlds - 1).bit_length()))
@@ -81,12 +79,7 @@ class Machine:
         self._told = Layout(fields_of(self._telemetry()), lanes)
         given: Named = dict.fromkeys(_MASKS, (_BOOL, sent.shape[1:-1]))
         given["sent"] = (sent.dtype, sent.shape[1:])
-        if world.scenery:
-            given[_LAYOUT] = (world.scenery.rows.dtype, (3,))
-        if world.scenery.openings.size:
-            openings = world.scenery.openings
-            given[_OPENINGS] = (openings.dtype, openings.shape[1:])
-        given |= fields_of(self._pushed())
+        given |= fields_of(world.scenery.shared()) | fields_of(self._pushed())
         given |= fields_of({_PHYSICS + name: x for name, x in seen.items()})
         self._outside = given | fields_of(self._seen())
         self._layouts = layout, self._told
@@ -165,7 +158,7 @@ class Machine:
         Actions (W, A, k), None if nobody flies; masks as of a `Record`; seeds of worlds, (W,).
         """
         if self.tape is not None and sent is not None:
-            self.tape.append(self.memory.copy())
+            self.tape.append(Before(self.memory.copy(), self._world.scenery.frozen()))
         worlds = self._worlds
         given = self._given
         all_fly = flown is None and begun is None and active is None
@@ -184,10 +177,8 @@ class Machine:
             self._fly(flown)
         if begun is not None:
             self._seed(begun, seeds)
-        if self._world.scenery:
-            given[_LAYOUT][:worlds] = self._world.scenery.rows
-        if _OPENINGS in given:
-            given[_OPENINGS][:worlds] = self._world.scenery.openings
+        for name, values in self._world.scenery.shared().items():
+            given[name][:worlds] = values
         if not self.is_whole:
             if begun is not None:
                 self._begin(begun)
@@ -242,11 +233,7 @@ class Machine:
             self._given[_PHYSICS + name][:worlds] = values
 
     def derivative(self) -> Derivative:
-        """That of a step. Raises `InputError` where there are solids, rays or pictures."""
-        instruments = len(self._loop.instruments)
-        if self._world.scenery or instruments:
-            got = f"{self._world.scenery.scene} and {instruments} of them"
-            raise InputError(f"derivative: expected bare ground, no rays, no pictures, got {got}")
+        """That of a step."""
         return Derivative(self._loop, self._layouts[0], self._width, self._worlds)
 
     def _seed(self, begun: Mask, seeds: Seeds | None) -> None:
@@ -338,10 +325,9 @@ class Machine:
             for name, values in arrays.items()
             if name.startswith(_PHYSICS)
         }
-        if _LAYOUT in arrays:
-            self._loop.world.scenery.rows = arrays[_LAYOUT]
-        if _OPENINGS in arrays:
-            self._loop.world.scenery.openings = arrays[_OPENINGS]
+        scenery = self._loop.world.scenery
+        for name in self._world.scenery.shared():
+            setattr(scenery, name, arrays[name])
         self._loop.put({name: arrays[name] for name in self._names})
         return arrays
 

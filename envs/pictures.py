@@ -11,7 +11,7 @@ from ..models.cameras import FARTHEST, View, chosen_views
 from ..scenes import SceneConfig
 from ..sim.sensors.instruments import Instrument, Moment
 from ..sim.state import ByName
-from .spec import ArraySpec
+from .spec import PICTURE, ArraySpec
 from .tasks.task import Task
 
 if TYPE_CHECKING:
@@ -37,6 +37,7 @@ def arrays_of(views: Sequence[View], objects: Sequence[str]) -> tuple[ArraySpec,
             high=highest[view.kind],
             unit=_UNITS.get(view.kind, ""),
             frame=view.camera.words,
+            axes=PICTURE,
             categories=categories,
         )
         arrays.append(array)

@@ -7,7 +7,7 @@ the env's code nor MuJoCo. This module imports neither.
 import json
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import MISSING, field, fields
+from dataclasses import MISSING, field, fields, replace
 from numbers import Real
 from typing import Annotated, Any, ClassVar, Final, Literal, Self
 
@@ -34,6 +34,8 @@ BODY_TO_WORLD = "body to world"
 
 IMAGE = ("row", "column")
 """Axes of an image, from its upper left corner on."""
+PICTURE = (*IMAGE, "channel")
+"""Axes of a picture."""
 RINGS = ("ring", "azimuth")
 """Axes of a lidar. Azimuths close a circle: the first follows the last."""
 
@@ -101,7 +103,7 @@ class _Part:
 class ArraySpec(_Part):
     """An array of one drone. Bounds of the same value are kept as one number."""
 
-    _optional = ("low", "high", "unit", "frame", "axes", "components", "categories")
+    _optional = ("low", "high", "unit", "frame", "axes", "components", "categories", "privileged")
 
     name: Name
     shape: tuple[int, ...]
@@ -119,6 +121,8 @@ class ArraySpec(_Part):
     """A name for each element, or none."""
     categories: Words = ()
     """What the values 0, 1, 2... stand for, where they are numbers of something; or none."""
+    privileged: bool = False
+    """Of an observation: for the critic alone, in training. Only our own agents know that."""
 
     def __post_init__(self) -> None:
         check_fields(self, "array: ", SpecError)
@@ -240,6 +244,7 @@ class EnvSpec(_Part):
     agents: Words = ("drone_0",)
     """One name for each drone of a world."""
     observation: tuple[ArraySpec, ...]
+    """Privileged arrays come last."""
     action: ArraySpec | Discrete
     telemetry: tuple[ArraySpec, ...] = ()
     """Further arrays of a State, for logs and pictures; the last, `metrics`, has the metrics."""
@@ -256,7 +261,9 @@ class EnvSpec(_Part):
         object.__setattr__(self, "constants", _checked_constants(self.constants))
         _check_different("agents", self.agents, MAX_AGENTS)
         _expect(self.agents, "agents", "at least one name", self.agents)
-        _expect(self.observation, "observation", "at least one array", self.observation)
+        hidden = [array.privileged for array in self.observation]
+        expected = "at least one array for the actor, and privileged ones last"
+        _expect(not all(hidden) and hidden == sorted(hidden), "observation", expected, hidden)
         _expect(len(self.marks) <= MAX_MARKS, "marks", f"at most {MAX_MARKS}", len(self.marks))
         for what, most in (("observation", MAX_ELEMENTS), ("telemetry", MAX_TOLD)):
             arrays = getattr(self, what)
@@ -269,6 +276,11 @@ class EnvSpec(_Part):
         _expect(in_telemetry == names, "metrics", expected, in_telemetry)
         components = [name for array in self.telemetry for name in component_names(array)]
         _check_different("telemetry: components", components, MAX_TOLD)
+
+    def for_actor(self) -> Self:
+        """The same without privileged arrays."""
+        seen = tuple(array for array in self.observation if not array.privileged)
+        return replace(self, observation=seen)
 
     def constant(self, name: str, user: str) -> float:
         """One of the constants. Raises `InputError`, which names its `user`, if it is not there."""

@@ -65,7 +65,7 @@ def spec_of(config: EnvConfig, task: Task) -> EnvSpec:
         vehicle_hash=task.vehicle.hash,
         config_digest=config.digest,
         agents=drone_names(config.drones),
-        observation=tuple(observation),
+        observation=tuple(sorted(observation, key=lambda array: array.privileged)),
         action=_action(task.controller),
         telemetry=tuple(quantity.spec for quantity in quantities_of(task)),
         metrics=task.metrics,

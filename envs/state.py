@@ -1,5 +1,6 @@
 """The state that a task sees."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -22,6 +23,9 @@ class State(WorldState):
     clearance: Array = FAR
     """Distance from a sphere about each body's origin, of `Vehicle.radius`, to the nearest solid
     but level ground, m, shape (W, A): below 0 within one, at most `FAR`."""
+    distance: Callable[[Array], Array]
+    """From points, world frame, m, (W, n, 3), to the nearest solid but level ground of each world,
+    m, (W, n): as `clearance`, without the sphere."""
     neighbours: NDArray[np.float64] | None = None
     """What each drone has heard of its neighbours, see `stages/radio.py`: shape (W, A, k, 7)."""
 

@@ -1,5 +1,7 @@
 """What stands around drones: the layout of each world, and distances to its solids."""
 
+from typing import NamedTuple
+
 import numpy as np
 from mujoco import mjtGeom
 from numpy.typing import NDArray
@@ -15,9 +17,18 @@ from .compile import Untraceable
 from .compile.tracer import call_outside
 from .random import SCENES, Draw, Random
 from .snapshots import Arrays, Kept, Snapshot
-from .state import FAR, Array, clip, is_traced, looked_up, parts_of
+from .state import FAR, Array, ByName, clip, is_traced, looked_up, parts_of
 
 _FURTHEST = 1e5  # m: of a craft that is lost
+
+
+class Frozen(NamedTuple):
+    """Layouts that stay as they are."""
+
+    shared: ByName
+    """As of `Scenery.shared`."""
+    layouts: Layouts
+    """To which its addresses lead."""
 
 
 class Scenery(Kept):
@@ -30,8 +41,7 @@ class Scenery(Kept):
         layouts: Solids of all layouts in use.
         which: Number of each world's layout, shape (W,).
         moves: Whether solids move.
-        rows: Of each world's layout how many primitives it has, and the addresses of their kinds
-            and of their table, uint64, shape (W, 3); traced while code is compiled.
+        rows: As of `rows_of`; traced while code is compiled.
         openings: Of each world's layout, as of `generators.openings_of`, shape (W, K, 6); traced
             likewise.
     """
@@ -59,6 +69,7 @@ class Scenery(Kept):
             self.which = np.arange(worlds)
             self._lay(np.flatnonzero(self.seeds >= 0))
         self.rows: Array
+        self._frozen: Frozen | None
         self._point()
 
     def __bool__(self) -> bool:
@@ -132,6 +143,7 @@ class Scenery(Kept):
         """
         if not self.moves:
             return
+        self._frozen = None
         rows = np.flatnonzero(mask[:, 0])
         centers = self._places[rows] + offsets(self._motions[rows], time[rows, None])
         self.centers[rows] = centers.transpose(0, 2, 1)
@@ -141,13 +153,36 @@ class Scenery(Kept):
         if self.varies:
             self.take(arrays["seeds"].copy())
 
+    def shared(self) -> ByName:
+        """What compiled code reads of each world, by the names of attributes, (W, ...)."""
+        shared = {"rows": self.rows} if self else {}
+        if self.openings.size:
+            shared["openings"] = self.openings
+        return shared
+
+    def frozen(self) -> Frozen:
+        """A copy of what stands there now, until something moves or is laid out."""
+        if self._frozen is None:
+            kinds, tables = self.layouts
+            layouts = Layouts(kinds.copy(), tables.copy())
+            shared = {name: array.copy() for name, array in self.shared().items()}
+            if self:
+                shared["rows"] = rows_of(layouts, self.which)
+            self._frozen = Frozen(shared, layouts)
+        return self._frozen
+
     def distance(self, position: Array, due: Array = None) -> Array:
         """From positions, (W, A, 3), to the nearest solid, m, float32, (W, A): at most `FAR`.
 
-        Only where `due`, bool, (W, A), is true, None being all; elsewhere 0.
+        Only where `due`, bool, (W, A), is true, elsewhere 0, and then without a derivative; None
+        is all.
         """
         code = kernels.compiled()
         near = _single(position)
+        if not self:
+            return np.zeros_like(near[..., 0]) + np.float32(FAR)
+        if due is not None:
+            near = _held(near)
         if is_traced(near):
             mask = near[..., 0] == near[..., 0] if due is None else due
             return self._called("nearest", mask, near)
@@ -158,9 +193,12 @@ class Scenery(Kept):
         return clip(found, np.float32(-FAR), np.float32(FAR))
 
     def along(self, position: Array, direction: Array) -> Array:
-        """From positions along unit vectors, (W, A, 3), to the first solid, as `distance`."""
-        near = _single(position)
-        ray = _single(direction)
+        """From positions along unit vectors, (W, A, 3), to the first solid, as `distance`.
+
+        Without a derivative, which has no bound where a ray grazes an edge.
+        """
+        near = _held(_single(position))
+        ray = _held(_single(direction))
         if is_traced(near):
             return self._called("first", near[..., 0] == near[..., 0], near, ray)
         kinds, tables = self.layouts
@@ -223,12 +261,25 @@ class Scenery(Kept):
         """Set `rows`, and the openings of given layouts."""
         if self._given.size and not self.moves:
             self.openings = self._openings[self.which]
-        self.rows = np.empty((len(self.seeds), 3), np.uint64)
-        self.rows[:, 0] = self.layouts.kinds.shape[1]
-        arrays: tuple[Array, Array] = self.layouts
-        for column, array in enumerate(arrays, 1):
-            stride = array[:1].nbytes
-            self.rows[:, column] = array.ctypes.data + stride * self.which
+        self.rows = rows_of(self.layouts, self.which)
+        self._frozen = None
+
+
+def rows_of(layouts: Layouts, which: Array) -> NDArray[np.uint64]:
+    """Of each world's layout how many primitives it has, and the addresses of their kinds and of
+    their table, (W, 3).
+    """
+    rows = np.empty((len(which), 3), np.uint64)
+    rows[:, 0] = layouts.kinds.shape[1]
+    arrays: tuple[Array, Array] = layouts
+    for column, array in enumerate(arrays, 1):
+        rows[:, column] = array.ctypes.data + array[:1].nbytes * which
+    return rows
+
+
+def _held(vectors: Array) -> Array:
+    """The same float32, which derivatives take as constants: whole numbers have none."""
+    return vectors.view(np.int32).view(np.float32)
 
 
 def _single(vectors: Array) -> Array:

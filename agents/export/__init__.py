@@ -73,10 +73,10 @@ def metadata(checkpoint: Checkpoint) -> dict[str, str]:
 
     `format`, `algorithm`, `seed`, `env_steps` (trained so far), and of the spec `env_id`,
     `options`, `control_period` (s), `vehicle`, `vehicle_hash`, `observation`, `action`; `inputs` is
-    the length of the observation as the file takes it: all arrays of the spec, one after the other.
+    the length of the observation as the file takes it: all its arrays, one after the other.
     A value that is not a text is JSON.
     """
-    spec = checkpoint.spec
+    spec = checkpoint.spec.for_actor()
     fields = json.loads(spec.to_json())
     facts = {
         "format": FORMAT,

@@ -37,6 +37,7 @@ class Measure(Stage):
             steps=steps,
             time=steps * self.period,
             clearance=self.world.clearance(),
+            distance=self.world.scenery.distance,
         )
         record.measured = record.state
 

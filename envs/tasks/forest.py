@@ -21,7 +21,7 @@ from ...sim import (
     stack,
     total,
 )
-from ..spec import Metric
+from ..spec import ArraySpec, Metric
 from ..state import State
 from .goal import LEAST_TILT_COSINE, MAX_RATE, MAX_SPEED, Number, along, array_of, ends_of
 from .task import Outcome, Task, TaskOptions
@@ -36,6 +36,9 @@ _NEAR = 0.03  # cost of a step that touches; e times less each 0.25 m further of
 _CHANGE = 0.005  # cost of the square of a change of the action, up to 2
 _ARRIVAL = 1.0
 _FAST = 1.05  # of the wanted speed: more speed earns nothing
+_KNOWN = 10.0  # m: the largest distance that a critic knows
+_PLACES = np.stack(np.meshgrid((0.0, 1.0, 2.0, 3.0, 4.5, 6.0), (-1.5, 0.0, 1.5), indexing="ij"))
+"""From where it knows distances: forward and left, m, shape (2, 6, 3)."""
 
 
 @immutable
@@ -50,6 +53,8 @@ class ForestOptions(TaskOptions):
     """From start to goal, m."""
     width: Annotated[float, Limits(10.0, 100.0, "m")] = 16.0
     """Of the wood, m."""
+    privileged: bool = False
+    """Whether a critic sees `distances`."""
 
 
 class Forest(Task):
@@ -64,6 +69,10 @@ class Forest(Task):
     wanted speed, m/s; time left at that speed, s; the last action (k).
 
     `depth`, `float32`, shape (6, 32): a depth camera of 120°, m. The option `sensors` takes others.
+
+    With `privileged` also `distances`, `float32`, shape (6, 3), for the critic alone: to the
+    nearest solid, up to 10 m, from points at the craft's height, 0 m to 6 m forward, and 1.5 m
+    right, straight on, and 1.5 m left.
 
     ## Action
 
@@ -121,6 +130,16 @@ class Forest(Task):
         """See the class."""
         options = self.options
         self.define_way(options.way, options.width)
+        if options.privileged:
+            distances = ArraySpec(
+                name="distances",
+                shape=_PLACES.shape[1:],
+                low=0.0,
+                high=_KNOWN,
+                unit="m",
+                privileged=True,
+            )
+            self.observation = (*self.observation, distances)
 
     def define_way(self, way: float, width: float) -> None:
         """Set `observation`, for a way to the goal and the width about it, m."""
@@ -196,7 +215,17 @@ class Forest(Task):
             *parts_of(state.body_rates), state.position[..., 2], way, memory.speed + 0.0 * way,
             left, *parts_of(memory.last),
         )  # fmt: skip
-        return {"observation": clip(stack(parts), *self._bounds)}
+        observed = {"observation": clip(stack(parts), *self._bounds)}
+        if len(self.observation) > 1:
+            numbers = (*parts_of(state.position), c, s)
+            x, y, z, cosine, sine = [number[..., None, None] for number in numbers]
+            forward, left = _PLACES
+            along = x + cosine * forward - sine * left
+            across = y + sine * forward + cosine * left
+            points = stack((along, across, z + 0.0 * left))
+            distances = state.distance(points.reshape(len(points), -1, 3))
+            observed["distances"] = clip(distances, 0.0, _KNOWN)
+        return observed
 
     def outcome(self, state: State) -> Outcome:
         """Progress, and the end at the goal, by contact or beside the wood."""

@@ -11,12 +11,15 @@ from functools import cache
 import numpy as np
 
 from .program import Function, Program, Value
-from .tracer import Traced, TracedArray
+from .tracer import Traced, TracedArray, call_outside
 
 Pairs = Sequence[tuple[Value, Value]]
 """Values, each with an adjoint, or with a part of it."""
 Found = dict[Value, Value]
 """Adjoints by their values."""
+
+_STEP = 2.0**-7
+"""To each end of a difference, in the argument's unit."""
 
 
 def adjoints(program: Program, outputs: Pairs, inputs: Sequence[Value]) -> list[Value]:
@@ -25,14 +28,14 @@ def adjoints(program: Program, outputs: Pairs, inputs: Sequence[Value]) -> list[
     Roundings and comparisons are steps: their derivative is 0, as that of whole numbers. A `select`
     passes an adjoint to the value that it takes. The branch that it leaves gets zeros, which stay
     zeros through a quotient or a root, so that branch may divide by 0. The root of 0 has the
-    derivative 0, and so has |0|.
+    derivative 0, and so has |0|. Functions of C are differentiated by central differences.
     """
     found: Found = {}
     _add(program, found, outputs)
     for value in reversed(_between(program, list(found), inputs)):
         if value not in found:
             continue
-        rule = _through_call if value.operation == "call" else _through_operation
+        rule = _RULES.get(value.operation, _through_operation)
         _add(program, found, rule(program, value, found))
     return [found.get(one) or program.constant(0.0, one.dtype) for one in inputs]
 
@@ -108,6 +111,25 @@ def _through_call(program: Program, value: Value, found: Found) -> Pairs:
     for number, one in enumerate(_floats(inputs)):
         pairs.append((one, program.value("call", one.dtype, backward, number, *given)))
     return pairs
+
+
+def _through_outside(program: Program, value: Value, found: Found) -> Pairs:
+    """As `_through_operation`, by differences: exact where the function is straight over them."""
+    address, *inputs = value.inputs
+    adjoint, *given = [TracedArray(program, one, one.dtype) for one in (found[value], *inputs)]
+    pairs = []
+    for place, x in enumerate(given):
+        if x.dtype.kind == "f":
+            low, high = x - _STEP, x + _STEP
+            before, after = given[:place], given[place + 1 :]
+            rise = call_outside(address, *before, high, *after)
+            rise = rise - call_outside(address, *before, low, *after)
+            slope = adjoint * (rise / (high - low))
+            pairs.append((inputs[place], slope.values.item()))
+    return pairs
+
+
+_RULES = {"call": _through_call, "outside": _through_outside}
 
 
 @cache

@@ -110,17 +110,14 @@ class Reference:
     def minibatch(self, *columns: np.ndarray) -> None:
         """A step of A2C, or with log-probabilities from before of PPO."""
         inputs, actions, advantage, targets, *before = map(torch.from_numpy, columns)
-        own, seen = inputs, inputs
-        if inputs.ndim == 3:
-            own, seen = inputs[:, :3, 0], inputs[..., 1]
         advantage = (advantage - advantage.mean()) / (advantage.std() + 1e-8)
-        log_probability, entropy = self.score(own, actions)
+        log_probability, entropy = self.score(inputs[:, :3], actions)
         gains = log_probability * advantage
         if before:
             ratio = (log_probability - before[0]).exp()
             clip = self.config.clip
             gains = torch.min(ratio * advantage, ratio.clamp(1 - clip, 1 + clip) * advantage)
-        errors = self.network("critic.", seen)[:, 0] - targets
+        errors = self.network("critic.", inputs)[:, 0] - targets
         loss = self.config.vf_coef * (errors**2).mean() - gains.mean()
         self.descend(loss - self.config.ent_coef * entropy)
 

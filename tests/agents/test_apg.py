@@ -75,6 +75,45 @@ def test_the_gradient_is_the_derivative_of_the_mean_reward(name: str, place: int
     assert slope == pytest.approx((low - high) / (2 * size), rel=0.02)
 
 
+def test_through_a_wood_the_gradient_is_that_with_the_depth_held() -> None:
+    """Against a difference in which each step shows what the depth camera showed before."""
+    steps, count, size = 8, 16, 2e-3
+    config = APGConfig(gamma=1.0, max_grad_norm=1e9, activation="tanh", hidden=(8,), log_std=-3.0)
+    options: dict[str, Any] = {"density": 0.2, "effects": {"motor_lag": True}}
+    agent, log = agent_of("rotorgram/Forest-v0", count, config, **options)
+    arrays, gradients = arrays_of(agent)
+    arrays["actor.layers.1.weight"][:, 0] = (0.15, 0.02, 0.01, 0.0)
+    flown(agent, log, 30)
+    env: Any = log.env
+    start = env.snapshot()
+    rollout = flown(agent, log, steps)
+    assert rollout.kept.all()
+    network = agent._actor.network
+    means = [network.forward(seen.T).T.copy() for seen in rollout.observations]
+    noise = rollout.actions - np.array(means)
+    agent.gradient(rollout)
+    gradient = gradients["actor.layers.1.weight"].copy()
+
+    def mean_reward(change: float, place: tuple[int, int]) -> float:
+        arrays["actor.layers.1.weight"][place] += change
+        env.restore(start)
+        total = 0.0
+        for step in range(steps):
+            seen = rollout.observations[step].copy()
+            seen[:, :20] = env.observations["observation"]
+            env.advance(network.forward(seen.T).T + noise[step])
+            total += env.rewards.mean() / steps
+        arrays["actor.layers.1.weight"][place] -= change
+        return total
+
+    assert mean_reward(0.0, (0, 0)) == pytest.approx(rollout.rewards.mean(), rel=1e-6)
+    for place in [(0, 0), (1, 0), (2, 0), (0, 3), (1, 5), (2, 8)]:
+        high, low = (mean_reward(change, place) for change in (size, -size))
+        expected = (low - high) / (2 * size)
+        assert gradient[place] == pytest.approx(expected, rel=0.02, abs=2e-5), place
+    assert abs(gradient).max() > 1e-3
+
+
 def climbing(steps: int, **options: Any) -> tuple[APG, Rollout]:
     """An agent that gives 0.1 whatever it sees, with as little noise as there may be."""
     register(CLIMB, Climb)

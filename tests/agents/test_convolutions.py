@@ -3,12 +3,13 @@
 import numpy as np
 import pytest
 import torch
+from contracts import spec_with
 from nets import bound
 from rotorgram.agents import Config
 from rotorgram.agents.layers import Weights
 from rotorgram.agents.networks import CNN, MLP, Network
 from rotorgram.envs import LocalVectorEnv
-from rotorgram.envs.spec import IMAGE, RINGS, ArraySpec, SpecError
+from rotorgram.envs.spec import IMAGE, PICTURE, RINGS, ArraySpec, SpecError
 from rotorgram.models import InputError
 from torch import Tensor
 from torch.nn import functional
@@ -16,10 +17,10 @@ from torch.nn import functional
 DICE = np.random.default_rng(0)
 BATCH = 5
 PLAIN = ArraySpec(name="plain", shape=(4,))
-PICTURE = ArraySpec(name="picture", shape=(6, 9), axes=IMAGE)
+DEPTH = ArraySpec(name="picture", shape=(6, 9), axes=IMAGE)
 LIDAR = ArraySpec(name="lidar", shape=(3, 10), axes=RINGS)
 AFTER = ArraySpec(name="after", shape=(2,))
-ARRAYS = [PLAIN, PICTURE, LIDAR, AFTER]
+ARRAYS = [PLAIN, DEPTH, LIDAR, AFTER]
 SMALL = Config(network="cnn", filters=(3, 2), hidden=(7,), activation="tanh")
 
 
@@ -108,6 +109,36 @@ def test_two_networks_compute_together_as_each_alone() -> None:
             np.testing.assert_allclose(ours, gradient, rtol=1e-4, atol=1e-5, err_msg=name)
 
 
+def test_a_picture_is_seen_with_its_colours() -> None:
+    """Channels come last, as cameras give them: against torch, where they come first."""
+    colours = ArraySpec(name="front", shape=(5, 4, 3), dtype="uint8", axes=PICTURE)
+    network = CNN([PLAIN, colours], 2, SMALL)
+    weights = bound(network)
+    weights.values[:] = 0.5 * normal(weights.values.size)
+    seen = normal(BATCH, 64)
+    network.forward(seen.T)
+    found = network.layers[0].forward(np.vstack((np.ones((1, BATCH)), seen.T)))[1:].T
+    names = [f"layers.0.layers.0.layers.{i}.weight" for i in range(2)]
+    channels = torch.from_numpy(seen[:, 4:].reshape(BATCH, 5, 4, 3)).permute(0, 3, 1, 2)
+    expected = channels
+    for name in names:
+        weight = torch.from_numpy(weights.arrays[name].copy())
+        padded = functional.pad(expected, (1, 1, 1, 1), mode="replicate")
+        kernel = weight[:, 1:].reshape(len(weight), -1, 3, 3)
+        expected = torch.tanh(functional.conv2d(padded, kernel, weight[:, 0], stride=2))
+    np.testing.assert_allclose(found[:, :4], seen[:, :4])
+    np.testing.assert_allclose(found[:, 4:], expected.flatten(1), rtol=1e-5, atol=1e-5)
+
+
+def test_pictures_of_cameras_are_images_for_a_cnn() -> None:
+    """Beside plain arrays alone; nothing is drawn."""
+    spec = spec_with("rotorgram/Landing-v0", cameras=["down@16x12,down_depth@16x12"])
+    assert [array.axes for array in spec.observation] == [(), PICTURE, PICTURE]
+    network = CNN(spec.observation, 2, SMALL)
+    shapes = [network.shapes[f"layers.0.layers.{i}.layers.0.weight"] for i in range(2)]
+    assert shapes == [(3, 28), (3, 10)]
+
+
 def test_a_ring_that_turns_turns_what_is_seen() -> None:
     """Two azimuths further: the outputs of the first convolution are one place further."""
     config = Config(network="cnn", filters=(3,), hidden=(1,))
@@ -127,7 +158,7 @@ def test_a_ring_that_turns_turns_what_is_seen() -> None:
 def test_an_mlp_takes_images_flat_and_a_cnn_of_plain_arrays_is_refused() -> None:
     mlp, _ = network_of(MLP)
     assert mlp.shapes["layers.0.weight"] == (7, 91)
-    with pytest.raises(InputError, match="network: expected rays in rows or rings for cnn, got"):
+    with pytest.raises(InputError, match="network: expected rays in rows or rings, or pictures,"):
         CNN([PLAIN, AFTER], 2, SMALL)
 
 

@@ -1,20 +1,37 @@
 """The derivative of a step: against torch's gradients, and against differences of NumPy's env."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from rotorgram.agents.policies import flat
-from rotorgram.envs import LocalVectorEnv
+from rotorgram.envs import LocalVectorEnv, Outcome, register
 from rotorgram.envs.compiled import CompiledLoop
+from rotorgram.envs.state import State
+from rotorgram.envs.tasks.hover import Hover
 from rotorgram.sim.snapshots import Snapshot
 
 FLIGHTS = json.loads((Path(__file__).parents[1] / "data/gradients.json").read_text())["flights"]
 DRAWN = {"landing": "the place of the pad is drawn, and the file has none"}
 MOTION = ("position", "quaternion", "velocity", "body_rates")
+NEAR = "test/Near-v0"
+SLAB = """
+[[obstacle]]
+kind = "box"
+position = [0.0, 0.0, 12.0]
+size = [20.0, 20.0, 1.0]
+"""
 PHASES = [[398.0], [267.0]]  # rows of the circle at which the file's drones begin
+
+
+class Near(Hover):
+    """Its reward is the clearance, m."""
+
+    def outcome(self, state: State) -> Outcome:
+        return replace(super().outcome(state), reward={"room": state.clearance})
 
 
 def env_of(env_id: str, count: int, **keywords: Any) -> LocalVectorEnv:
@@ -166,6 +183,86 @@ def test_two_drones_of_a_world_against_differences_of_numpy() -> None:
         expected = (ends[0] - ends[1]) / (2 * size)
         assert found[place] == pytest.approx(expected, rel=1e-3, abs=1e-4), place
     assert abs(found).max() > 0.01
+
+
+def test_a_flight_in_a_wood_against_differences() -> None:
+    """Six steps of Forest-v0. Where a limit lies between the ends of a difference, both are wrong.
+
+    Actions are given: what the depth camera shows changes nothing.
+    """
+    draw = np.random.default_rng(1)
+    count, steps, size = 16, 6, 2.0**-9
+    options: dict[str, Any] = {"density": 0.2, "effects": {"motor_lag": True}}
+    env = env_of("rotorgram/Forest-v0", count, **options)
+    ahead = np.zeros((count, 4), np.float32)
+    ahead[:, 0] = 0.15
+    for _ in range(40):
+        env.advance(ahead)
+    start = env.snapshot()
+    actions = draw.uniform(-0.4, 0.4, (steps, count, 4)).astype(np.float32)
+    by_reward = draw.normal(size=(steps, count))
+    nothing = np.zeros_like(flat(env.observations, env.env_spec, count))
+    found = derivatives(env, actions, by_reward, nothing)
+    errors = []
+    for step, number in np.ndindex(steps, 4):
+        ends = []
+        for move in (size, -size):
+            moved = actions.copy()
+            moved[step, :, number] += move
+            env.restore(start)
+            ends.append((flown(env, moved, by_reward, nothing), moved[step, :, number]))
+        (upper, high), (lower, low) = ends
+        expected = (upper - lower) / (high.astype(float) - low)
+        errors.append(abs(found[step, :, number] - expected))
+    assert np.median(errors) < 1e-6
+    assert np.mean(np.array(errors) < 1e-4) > 0.9
+    assert np.median(abs(found)) > 1e-3
+
+
+def test_a_distance_to_a_solid_has_a_derivative(tmp_path: Path) -> None:
+    """Under a slab a rotor's output of 1 lifts 20 kg by 51 N: 0.051 m/s after a step of 0.02 s.
+
+    So in its own step the craft comes 0.51 mm nearer, and 1.02 mm in each later one.
+    """
+    register(NEAR, Near)
+    scene = tmp_path / "slab.toml"
+    scene.write_text(SLAB)
+    level = {"start_tilt": 0.0, "start_heading": 0.0, "scene": str(scene)}
+    env = env_of(NEAR, 3, **level)
+    actions = np.full((4, 3, 4), 0.1, np.float32)
+    nothing = np.zeros_like(flat(env.observations, env.env_spec, 3))
+    found = derivatives(env, actions, np.ones((4, 3)), nothing)
+    ways = [0.51 + 1.53 + 2.55 + 3.57, 0.51 + 1.53 + 2.55, 0.51 + 1.53, 0.51]
+    expected = -1e-3 * np.array(ways)[:, None, None] * np.ones((4, 3, 4))
+    assert found == pytest.approx(expected, rel=1e-2)
+
+
+def test_a_derivative_knows_the_solids_of_its_step() -> None:
+    """Later steps begin episodes among other trees, in the same memory."""
+    register(NEAR, Near)
+    env = env_of(NEAR, 4, scene="forest:new,density=0.1,size=40x40", episode_length=3)
+    for seed in range(30):  # until there is room for the largest layout
+        env.reset(seed=seed)
+    machine = env.loop.machine()
+    machine.tape = []
+    actions = np.full((4, 4), 0.1, np.float32)
+    tables = env.loop.world.scenery.layouts.tables
+    for _ in range(3):
+        env.advance(actions)
+    derivative = machine.derivative()
+    nothing = np.zeros_like(flat(env.observations, env.env_spec, 4))
+    ended = np.ones(4, bool)
+    before = derivative.back(machine.tape[0], actions, np.ones(4), nothing, ended)
+    layouts = env.loop.world.scenery.seeds.copy()
+    env.advance(actions, env.loop.done)
+    env.advance(actions)
+    assert (env.loop.world.scenery.seeds != layouts).all()
+    assert env.loop.world.scenery.layouts.tables is tables
+    after = derivative.back(machine.tape[0], actions, np.ones(4), nothing, ended)
+    assert before.tobytes() == after.tobytes()
+    other = derivative.back(machine.tape[3], actions, np.ones(4), nothing, ended)
+    assert abs(before).min() > 0.0
+    assert (before != other).any(axis=1).all()
 
 
 def test_after_an_end_nothing_counts() -> None:

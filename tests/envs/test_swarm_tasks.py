@@ -50,6 +50,7 @@ class Heard:
         state = State(
             position=position, velocity=velocity, quaternion=none, body_rates=none, command=none,
             thrust=none, touching=SPEAKING, action=none, steps=0, time=0.0,
+            distance=lambda points: points[..., 0],
         )  # fmt: skip
         self.record.state = self.record.measured = state
         self.stage.step(self.record)

@@ -2,6 +2,7 @@
 
 import socket
 from contextlib import closing
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,10 +12,10 @@ from rotorgram.envs import LocalVectorEnv
 from rotorgram.udp import LinkConfig, RemoteVectorEnv, Simulator
 
 
-@pytest.mark.parametrize("name", ["Forest", "Dodge"])
-def test_the_same_bits_with_a_loss_of_a_twentieth(name: str) -> None:
+@pytest.mark.parametrize(("name", "more"), [("Forest", {"privileged": True}), ("Dodge", {})])
+def test_the_same_bits_with_a_loss_of_a_twentieth(name: str, more: dict[str, bool]) -> None:
     env_id = f"rotorgram/{name}-v0"
-    options = {"backend": "rigid", "episode_length": 25}
+    options: dict[str, Any] = {"backend": "rigid", "episode_length": 25, **more}
     local = LocalVectorEnv(env_id, 6, **options)
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as taken:
         taken.bind(ANY)
