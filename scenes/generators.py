@@ -54,6 +54,16 @@ _MOST_PARTS = 1 + int(_COUNTS.max())  # of a tree
 Names = Callable[[], Sequence[str]]
 
 
+def about_z(headings: Array) -> Array:
+    """Axes that are turned, (n, 3, 3)."""
+    axes = np.zeros((len(headings), 3, 3))
+    axes[:, 0, 0] = axes[:, 1, 1] = settled(np.cos(headings))
+    axes[:, 1, 0] = settled(np.sin(headings))
+    axes[:, 0, 1] = -axes[:, 1, 0]
+    axes[:, 2, 2] = 1.0
+    return axes
+
+
 class Parts(NamedTuple):
     """Primitives, as geoms of MuJoCo."""
 
@@ -65,12 +75,19 @@ class Parts(NamedTuple):
     positions: Array
     """Of their centers, m, shape (n, 3)."""
     materials: Names
-    axes: Array
-    """As columns, shape (n, 3, 3)."""
+    headings: Array
+    """rad, shape (n,)."""
     motions: Array
     """As of `motion`, shape (n, 11)."""
     grids: NDArray[np.object_]
     """As of `Solids`, shape (n,)."""
+    turned: Array | None = None
+    """Axes as columns, (n, 3, 3), in place of the headings."""
+
+    @property
+    def axes(self) -> Array:
+        """As columns, shape (n, 3, 3)."""
+        return about_z(self.headings) if self.turned is None else self.turned
 
 
 class Draft:
@@ -90,12 +107,13 @@ class Draft:
 
     def choose(self, name: str) -> str:
         """One of the materials of several colours."""
-        return self.choices(name, 1)[0]
+        return self.choices(name, 1)()[0]
 
-    def choices(self, name: str, count: int) -> list[str]:
+    def choices(self, name: str, count: int) -> Names:
         """As many such materials."""
         colours = len(self.scene.type.materials[name]["colours"])
-        return [f"{name}_{one}" for one in self.rng.integers(colours, size=count).tolist()]
+        drawn = self.rng.integers(colours, size=count)
+        return lambda: [f"{name}_{one}" for one in drawn.tolist()]
 
     def around(self, reach: float, far: float) -> tuple[float, float]:
         """A place up to `far`, whose circle of radius `reach` does not touch the clear space."""
@@ -131,17 +149,13 @@ class Draft:
     ) -> None:
         """Add parts; one heading may be that of all, and so may one motion."""
         rows = np.array(positions, float)
-        turns = np.full(len(rows), headings, float)
-        axes = np.zeros((len(rows), 3, 3))
-        axes[:, 0, 0] = axes[:, 1, 1] = settled(np.cos(turns))
-        axes[:, 1, 0] = settled(np.sin(turns))
-        axes[:, 0, 1] = -axes[:, 1, 0]
-        axes[:, 2, 2] = 1.0
         own = np.array(kinds, np.int8), np.array(sizes, float)
+        turns = np.full(len(rows), headings, float)
         motions = np.zeros((len(rows), len(REST)))
-        motions[:] = motion
+        if motion is not REST:
+            motions[:] = motion
         grids = np.full(len(rows), None)
-        self.parts.append(Parts(names, *own, rows, materials, axes, motions, grids))
+        self.parts.append(Parts(names, *own, rows, materials, turns, motions, grids))
 
     def add_heights(
         self, name: str, half: Vector, heights: Array, depth: float, material: str
@@ -210,7 +224,12 @@ def forest(wood: Draft) -> None:
     add("tree_{}/trunk", CYLINDER, (trunk, 0.3 * tall, trunk), 0.3 * tall, 0, materials=bark)
     _add_crowns(wood, kinds, tall, spread, places[:trees], aside, leaves)
     add(
-        "shrub_{}/crown", SPHERE, (radii,) * 3, 0.1 * radii, trees, materials=lambda: leaves[trees:]
+        "shrub_{}/crown",
+        SPHERE,
+        (radii,) * 3,
+        0.1 * radii,
+        trees,
+        materials=lambda: leaves()[trees:],
     )
     add(
         "rock_{}/stone", BOX, 0.8 * sides.T, 0.2 * sides[:, 2], green,
@@ -220,7 +239,7 @@ def forest(wood: Draft) -> None:
 
 def _add_crowns(
     wood: Draft, kinds: Array, tall: Array, spread: Array, places: Array, aside: Array,
-    leaves: Sequence[str],
+    leaves: Names,
 ) -> None:  # fmt: skip
     """Add the crowns of all trees; the kind of a tree says how many it has."""
     counts = _COUNTS[kinds]
@@ -235,7 +254,7 @@ def _add_crowns(
     wood.add_all(
         lambda: [f"tree_{i}/{_PARTS[k]}" for i, k in zip(tree.tolist(), row.tolist(), strict=True)],
         shape, np.column_stack((radius, half, half)), centers,
-        lambda: [leaves[i] for i in tree.tolist()],
+        lambda: list(map(leaves().__getitem__, tree.tolist())),
     )  # fmt: skip
 
 

@@ -56,12 +56,13 @@ def add_parts(spec: MjSpec, scene: SceneConfig) -> None:
 def add_geoms(spec: MjSpec, scene: str, parts: Parts) -> list[MjsGeom]:
     """Add parts of a scene to a spec, which touch and weigh nothing."""
     geoms = []
+    axes = parts.axes
     for i, own in enumerate(parts.names()):
         name = f"{scene}/{own}"
         quaternion = np.empty(4)
-        mujoco.mju_mat2Quat(quaternion, parts.axes[i].ravel())
+        mujoco.mju_mat2Quat(quaternion, axes[i].ravel())
         shape = shape_of(spec, name, parts.sizes[i], parts.grids[i])
-        position = parts.positions[i] + least_of(parts.grids[i]) * parts.axes[i, :, 2]
+        position = parts.positions[i] + least_of(parts.grids[i]) * axes[i, :, 2]
         geom = spec.worldbody.add_geom(
             name=name, type=GEOM_TYPES[parts.kinds[i]], pos=position, quat=quaternion,
             contype=0, conaffinity=0, group=GROUP, mass=0.0, density=0.0, **shape,

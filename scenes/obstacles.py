@@ -146,7 +146,8 @@ def parts_of_obstacles(obstacles: Sequence[Obstacle]) -> Parts:
         sizes=sizes,
         positions=centers,
         materials=lambda: [""] * count,
-        axes=settled(axes),
+        headings=np.zeros(count),
         motions=np.zeros((count, len(REST))),
         grids=grids,
+        turned=settled(axes),
     )

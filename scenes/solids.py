@@ -20,7 +20,7 @@ from . import kernels
 from .build import HIDDEN_GROUP, add_scene, is_ground
 from .config import SceneConfig, parse_scene
 from .fields import centered, check_points
-from .generators import Parts, parts_of
+from .generators import Parts, about_z, parts_of
 from .looks import HALL_XML
 from .motion import REST, offsets
 from .obstacles import OWN, Obstacle, obstacles_of, parts_of_obstacles
@@ -80,7 +80,8 @@ class Solids:
         """What stands in a scene from a seed."""
         if not parts:
             return cls.of_obstacles(())
-        _, kinds, sizes, centers, _, axes, motions, grids = zip(*parts, strict=True)
+        _, kinds, sizes, centers, _, turns, motions, grids, turned = zip(*parts, strict=True)
+        axes = about_z(np.concatenate(turns)) if turned[0] is None else np.concatenate(turned)
         kind = np.concatenate(kinds)
         half = _halves(kind, np.concatenate(sizes))
         center = np.concatenate(centers)
@@ -93,7 +94,7 @@ class Solids:
             label=lambda: tuple(f"{scene}/{name}" for one in parts for name in one.names()),
             kinds=kind,
             centers=center,
-            axes=np.concatenate(axes),
+            axes=axes,
             halves=half,
             motions=np.concatenate(motions),
             grids=np.concatenate(grids),
@@ -184,9 +185,12 @@ class Solids:
     def standing(self) -> "Solids":
         """What reaches above level ground at z = 0."""
         kept = self.centers[:, 2] + (abs(self.axes[:, 2]) * self.halves).sum(axis=1) > 1e-6
+        first = int(kept.argmax()) if len(kept) else 0
+        rest = slice(first, None)
+        chosen = rest if kept[rest].all() else kept  # quicker
         return Solids(
             lambda: tuple(compress(self.names, kept)),
-            *[getattr(self, one.name)[kept] for one in fields(self)[1:]],
+            *[getattr(self, one.name)[chosen] for one in fields(self)[1:]],
         )
 
     @cached_property

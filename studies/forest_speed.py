@@ -21,7 +21,7 @@ from measuring import RESULTS, in_turns, options, write
 from rotorgram.envs import LocalVectorEnv
 
 FOREST = "rotorgram/Forest-v0"
-WOOD = "forest:0-63,density=0.033,size=34x16,clear=ends"
+WOOD: dict[str, Any] = {"scene": "forest:0-63", "density": 0.033}
 STEPS = 40
 
 
@@ -78,7 +78,7 @@ def main() -> None:
     blind: dict[str, Any] = {"sensors": {}}
     held = {**blind, "scene": "plain", "action": "rotors"}
     envs = {
-        "wood": env_of(args.drones, scene=WOOD, **blind),
+        "wood": env_of(args.drones, **WOOD, **blind),
         "plain": env_of(args.drones, scene="plain", **blind),
         "held": env_of(args.drones, **held),
         "held twice": env_of(args.drones, **held, control_period=0.1),

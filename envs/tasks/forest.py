@@ -137,6 +137,7 @@ class Forest(Task):
                 low=0.0,
                 high=_KNOWN,
                 unit="m",
+                axes=("forward", "left"),
                 privileged=True,
             )
             self.observation = (*self.observation, distances)
@@ -216,7 +217,7 @@ class Forest(Task):
             left, *parts_of(memory.last),
         )  # fmt: skip
         observed = {"observation": clip(stack(parts), *self._bounds)}
-        if len(self.observation) > 1:
+        if any(array.privileged for array in self.observation):
             numbers = (*parts_of(state.position), c, s)
             x, y, z, cosine, sine = [number[..., None, None] for number in numbers]
             forward, left = _PLACES
