@@ -16,8 +16,6 @@ from .policies import Policy
 class Controller(Policy, Protocol):
     """What a class of controllers has. One object flies one drone."""
 
-    label: ClassVar[str]
-    """Name in tables and figures."""
     options: ClassVar[Mapping[str, object]]
     """Options of the env that it needs, as {"action": "velocity"}: commands set them."""
 
@@ -26,7 +24,7 @@ class Controller(Policy, Protocol):
 
 
 CONTROLLERS: Final[Mapping[str, type[Controller]]] = {"pid": PID, "geometric": Geometric}
-_NEEDED = ("label", "options", "reset", "act")
+_NEEDED = ("options", "reset", "act")
 
 
 def is_controller(name: str) -> bool:
@@ -45,4 +43,6 @@ def find_controller(name: str) -> type[Controller]:
             f"controller: expected a class with {', '.join(_NEEDED)}, "
             f"got {name} without {missing[0]}"
         )
+    if not isinstance(kind.options, Mapping):
+        raise InputError(f"controller: expected a table as options of {name}, got {kind.options}")
     return kind

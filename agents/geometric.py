@@ -35,7 +35,6 @@ class Geometric:
     Raises `InputError` for an env that lacks what it needs.
     """
 
-    label: ClassVar[str] = "Geometric"
     options: ClassVar[Mapping[str, object]] = {"action": "position"}
     """Options of the env that it flies."""
 

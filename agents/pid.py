@@ -29,7 +29,6 @@ class PID:
     Raises `InputError` for another env, or where options or telemetry lack what it needs.
     """
 
-    label: ClassVar[str] = "PID"
     options: ClassVar[Mapping[str, object]] = {}
     """Options of the env that it needs."""
 

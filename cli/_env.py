@@ -15,7 +15,7 @@ from ..agents import (
     is_controller,
     load,
 )
-from ..envs.config import BACKEND_KEYWORDS, BackendConfig
+from ..envs.config import BACKEND_KEYWORDS, KEYWORDS, BackendConfig
 from ..envs.registry import env_spec, is_known, task_type
 from ..envs.spec import EnvSpec
 from ..flights.trajectories import Trajectory
@@ -75,10 +75,11 @@ def fitted(command: F, checkpoint: Pilot) -> F:
     if env_id != checkpoint.env_id:
         if "env" in command.given:
             return command
-        if options:
+        foreign = set(options).difference(KEYWORDS)
+        if foreign:
             raise InputError(
                 f"env: expected --env {checkpoint.env_id} with options of the task that the "
-                f"policy was trained on, got options of {env_id}"
+                f"policy was trained on, got {', '.join(sorted(foreign))} of {env_id}"
             )
     options = {**checkpoint.options, **options}
     changes: Options = {"env": checkpoint.env_id, "options": options}

@@ -53,4 +53,4 @@ class Evaluate(AgentFlags, BackendFlags):
                 print(f"{name:10} {mean_end:.3g} {metric.unit}".rstrip())
         hard = mean_traversability(trajectories)
         if hard == hard:  # no nan
-            print(f"scene      traversability {hard:.1f}")
+            print(f"scene      traversability {hard:.1f} radii")

@@ -77,6 +77,9 @@ class Render(EnvFlags):
         vehicles = [vehicle for _, vehicle in found if vehicle]
         config = replace(config, vehicle=next(iter(vehicles), None))
         tracks = [track for track, _ in found]
+        longest = max(track.trajectories[0].seconds for track in tracks)
+        if self.at is not None and self.at > longest:
+            raise InputError(f"at: expected 0 to {longest:g} s, the flight's end, got {self.at:g}")
         with bars() as progress:
             frames = film(self.out, tracks, config, partial(progress, self.out.name))
         pictures = "1 picture" if frames == 1 else f"{frames} pictures"

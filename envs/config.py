@@ -166,6 +166,7 @@ class EnvConfig:
             options = chosen.to_options()
             usual = task.scene(chosen)
         scene = usual if self.scene is None else SceneConfig.parse(self.scene).filled(usual)
+        scene.check_most()
         set_fields(self, task=json_values(options), scene=scene)
 
     # ---- other forms
@@ -204,7 +205,9 @@ class EnvConfig:
         own: Any = {"scene": None, "sensors": None}
         usual = replace(self, **own)  # with those of the task, which follow from its options
         scene = self.scene
-        if scene.name == usual.scene.name:  # its options follow from the task's
+        if (
+            scene.name == usual.scene.name and usual.scene.options
+        ):  # its options follow from the task's
             scene = replace(scene, options={})
         values["scene"] = None if self.scene == usual.scene else str(scene)
         values["task"] = {name: value for name, value in self.task.items() if name in KEYWORDS}

@@ -40,7 +40,6 @@ class Orca:
     `InputError` for an env that lacks what it needs.
     """
 
-    label: ClassVar[str] = "ORCA"
     options: ClassVar[Mapping[str, object]] = {"action": "velocity"}
     """Options of the env that it flies."""
 

@@ -69,7 +69,6 @@ class Vfh:
     batch. Raises `InputError` for an env that lacks what it needs.
     """
 
-    label: ClassVar[str] = "VFH+"
     options: ClassVar[Mapping[str, object]] = {
         "action": "velocity",
         "sensors": {"lidar": {"model": "rplidar_a1"}},

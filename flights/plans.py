@@ -53,8 +53,8 @@ def drawn_plan(flights: Mapping[str, Trajectory]) -> "Figure":
     height = np.median(z)
     axes.set_title(f"{scene}: solids at a height of {height:.1f} m", loc="left", fontsize=9)
     axes.set_aspect("equal", "datalim")
-    axes.margins(0.1)
-    axes.apply_aspect()
+    axes.margins(0.2)
+    figure.draw_without_rendering()  # the layout sets the limits
     across = np.linspace(*axes.get_xlim(), _CELLS)
     up = np.linspace(*axes.get_ylim(), _CELLS)
     points = np.stack(np.meshgrid(across, up, height), axis=-1)[:, :, 0]

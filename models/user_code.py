@@ -16,7 +16,7 @@ from .errors import InputError, one_line
 def names_class(words: str) -> bool:
     """Whether words name a class in a file, rather than something that is known by its name."""
     file, _, name = words.rpartition(":")
-    return file.endswith(".py") or name.endswith(".py")
+    return name.endswith(".py") or (file.endswith(".py") and name.isidentifier())
 
 
 def load_class(option: str, words: str) -> type:
@@ -47,7 +47,7 @@ def _module(option: str, path: Path) -> ModuleType:
     module = sys.modules[key] = module_from_spec(spec)
     try:
         spec.loader.exec_module(module)
-    except Exception as error:  # of the user's code, any
+    except (Exception, SystemExit) as error:  # of the user's code, any
         del sys.modules[key]
         lines = [
             at.lineno for at in traceback.extract_tb(error.__traceback__) if at.filename == key

@@ -72,9 +72,12 @@ class SceneConfig:
         values = self.values
         given = {name: getattr(values, name) for name in rules if name in self.options}
         set_fields(self, options=given)
-        if values.most > MAX_SOLIDS:
-            expected = f"at most {MAX_SOLIDS} parts"
-            raise InputError(f"scene: expected {expected}, got {values.most} of {self}")
+
+    def check_most(self) -> None:
+        """Raise `InputError` for too many parts."""
+        most = self.values.most
+        if most > MAX_SOLIDS:
+            raise InputError(f"scene: expected at most {MAX_SOLIDS} parts, got {most} of {self}")
 
     @cached_property
     def values(self) -> Any:
@@ -136,7 +139,8 @@ class SceneConfig:
             return self
         for name, value in self.options.items():
             if _rounded(value) != _rounded(usual.options.get(name)):
-                raise InputError(f"scene: expected {usual}, as the task's options say, got {self}")
+                task = replace(self, options=usual.options)
+                raise InputError(f"scene: expected {task}, as the task's options say, got {self}")
         return replace(self, options=usual.options)
 
     def unseen(self) -> "SceneConfig":
@@ -189,6 +193,7 @@ def parse_scene(text: Any) -> SceneConfig:
     scene = SceneConfig.parse(text)
     if len(scene.given_scenes) != 1:
         raise InputError(f"scene: expected one, got {scene}")
+    scene.check_most()
     return scene
 
 

@@ -98,11 +98,11 @@ class Heights:
         """As `fields.Rule`."""
         if isinstance(value, tuple) and not value:
             return ()
-        heights = np.array(value, float)
-        if heights.ndim != 2 or not (abs(heights) <= 1e3).all():
+        heights = np.array(value)
+        if heights.dtype.kind not in "if" or heights.ndim != 2 or not (abs(heights) <= 1e3).all():
             raise ValueError
         check_points(len(heights), heights.shape[1], "heights")
-        return tuple(map(tuple, heights.tolist()))
+        return tuple(map(tuple, heights.astype(float).tolist()))
 
 
 def check_points(rows: int, columns: int, where: str) -> None:

@@ -61,12 +61,14 @@ def _of_mjcf(path: Path) -> tuple[Obstacle, ...]:
     try:
         spec = MjSpec.from_file(str(path))
         for field in spec.hfields:
-            _check_picture(path.parent / spec.meshdir / field.file)
+            if field.file:
+                file = Path(field.file).name if spec.strippath else field.file
+                _check_picture(path.parent / spec.meshdir / file)
         _keep_solids(spec)
         model = spec.compile()
     except InputError:
         raise
-    except (ValueError, mujoco.FatalError) as error:
+    except (ValueError, RuntimeError, mujoco.FatalError) as error:
         raise InputError(f"expected MJCF that MuJoCo reads, got: {one_line(error)}") from None
     moves = model.body_weldid[model.geom_bodyid] != 0
     if moves.any():
@@ -90,13 +92,17 @@ def _of_mjcf(path: Path) -> tuple[Obstacle, ...]:
 
 
 def _check_picture(path: Path) -> None:
-    """Refuse a PNG file of too many heights, before MuJoCo reads it. Raises `InputError`."""
+    """Refuse heights of another file than a small PNG, before MuJoCo reads it. Raises
+    `InputError`.
+    """
+    header = b""
     if path.is_file():
         with path.open("rb") as file:
             header = file.read(24)
-        if header[12:16] == b"IHDR":
-            columns, rows = struct.unpack(">II", header[16:])
-            check_points(rows, columns, path.name)
+    if header[12:16] != b"IHDR":
+        raise InputError(f"expected heights from a PNG beside the scene's file, got {path.name}")
+    columns, rows = struct.unpack(">II", header[16:])
+    check_points(rows, columns, path.name)
 
 
 def _keep_solids(spec: MjSpec) -> None:

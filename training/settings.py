@@ -93,6 +93,9 @@ class Row:
     """Env steps of each training, of all its drones together; 0: those of the preset."""
     num_envs: NonNegativeInt = 0
     """Drones that fly at the same time in each training; 0: those of the preset."""
+    brought: Mapping[str, object] | None = None
+    """Options of the env that a controller needs; None: those of its class. To report a study runs
+    no file of a controller."""
 
     def __post_init__(self) -> None:
         if not (self.controller or self.agent in ALGORITHMS):
@@ -101,13 +104,16 @@ class Row:
                 f"agent: expected one of {known}, or FILE.py:CLASS of a controller, "
                 f"got {self.agent}"
             )
+        if self.brought is None:
+            needed = find_controller(self.agent).options if self.controller else {}
+            set_fields(self, brought=dict(needed))
         check_fields(self)
         backend = self.env.backend.name
         if backend != "mujoco":
             raise InputError(f"env: expected the backend mujoco, for evaluation, got {backend}")
         usual = EnvConfig(env_id=self.env.env_id).flat_options()
         given = self.env.flat_options()
-        brought = {k: v for k, v in self.brought.items() if given.get(k) == usual.get(k)}
+        brought = {k: v for k, v in (self.brought or {}).items() if given.get(k) == usual.get(k)}
         if brought:
             set_fields(self, env=self.env.changed(**brought))
         set_fields(self, name=self.name or self.default_name)
@@ -143,7 +149,7 @@ class Row:
         controller's, the vehicle.
         """
         env = self.env
-        usual = {**EnvConfig(env_id=env.env_id).flat_options(), **self.brought}
+        usual = {**EnvConfig(env_id=env.env_id).flat_options(), **(self.brought or {})}
         words = [env.env_id.rpartition("/")[2]]
         for name, value in env.flat_options().items():
             if value != usual.get(name):
@@ -158,11 +164,6 @@ class Row:
     def controller(self) -> bool:
         """Whether the agent is not trained."""
         return is_controller(self.agent)
-
-    @property
-    def brought(self) -> Mapping[str, object]:
-        """Options of the env that a controller needs."""
-        return find_controller(self.agent).options if self.controller else {}
 
     @property
     def config(self) -> Config:

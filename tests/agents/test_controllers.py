@@ -14,7 +14,6 @@ STILL = """
 import numpy as np
 
 class Still:
-    label = "Nothing"
     options = {"action": "offset"}
 
     def __init__(self, spec):
@@ -27,7 +26,6 @@ class Still:
         return np.zeros(self.size, np.float32)
 
 class Half:
-    label = "Half"
     options = {}
 
     def reset(self):
@@ -55,7 +53,7 @@ def test_names_and_files() -> None:
 def test_a_file_is_run_once(still: str) -> None:
     assert find_controller(still) is find_controller(still)
     assert still not in CONTROLLERS
-    assert agent_label(still) == "Nothing"
+    assert agent_label(still) == "Still"
     assert agent_color(still) == agent_color("pid")
 
 
@@ -71,7 +69,11 @@ def test_a_row_of_a_study(still: str) -> None:
     assert row.name == "still Elevation-v0"
     assert row.env.flat_options()["action"] == "offset"
     assert row.controller
-    assert row_label(row) == "Nothing"
+    assert row_label(row) == "Still"
+    table = row.to_dict()
+    Path(still.rpartition(":")[0]).write_text("raise RuntimeError")
+    stored = Row.from_dict("row", {**table, "agent": "elsewhere.py:Still"})  # nothing is run
+    assert stored.env == row.env
 
 
 @pytest.mark.parametrize(
@@ -79,7 +81,7 @@ def test_a_row_of_a_study(still: str) -> None:
     [
         (STILL, "Moves", "expected a class of {file}, got 'Moves'"),
         (STILL, "Number", "expected a class of {file}, got 'Number'"),
-        (STILL, "Half", "expected a class with label, options, reset, act, got {file}:Half "
+        (STILL, "Half", "expected a class with options, reset, act, got {file}:Half "
                         "without act"),
         ("a = 1\nb = a / 0\n", "Still", "wrong.py fails: ZeroDivisionError: division by zero, "
                                         "line 2"),

@@ -16,7 +16,7 @@ from rotorgram.models import InputError
 from rotorgram.scenes import Solids
 from rotorgram.udp.spawn import spawn_simulator
 
-SCENE = "forest:3,density=0.05,size=30x30"
+SCENE = "forest:3,size=30x30,density=0.05"
 PERIOD = 0.02  # s
 
 

@@ -114,7 +114,7 @@ def test_what_a_maze_refuses() -> None:
     with pytest.raises(InputError, match=r"^scene: expected some of size, clear, got 'density'"):
         SceneConfig.parse("maze:1,density=0.1")
     with pytest.raises(InputError, match=r"^scene: expected at most 10000 parts, got 17694"):
-        SceneConfig.parse("maze:1,size=400x400")
+        EnvConfig(scene="maze:1,size=400x400")
     with pytest.raises(InputError, match=r"^scene: expected a size of 30 m or more, or clear="):
         SceneConfig.parse("maze:1,size=24x24")
 
