@@ -4,6 +4,7 @@ Those of NumPy's `@` and `linalg` do, as BLAS and LAPACK have other code for eac
 """
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -18,6 +19,17 @@ def settled(values: ArrayLike, size: float = 1.0) -> Array:
     The last bits of what MuJoCo's compiler computes differ between processors.
     """
     return np.round(np.asarray(values), 12 - round(math.log10(size))) + 0.0
+
+
+def dot(a: Sequence[Array], b: Sequence[Array]) -> Array:
+    """Of the components of two vectors, numbers or arrays."""
+    total: Array = a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+    return total
+
+
+def cross(a: Sequence[Array], b: Sequence[Array]) -> tuple[Array, Array, Array]:
+    """As `dot`."""
+    return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
 
 
 def product(a: Array, b: Array) -> Array:

@@ -50,7 +50,7 @@ def aisles(hall: "Draft") -> None:
     options: AislesOptions = hall.options
     rows, count = options.counts
     wide, deep = options.size
-    hall.add("ground/floor", "plane", (150, 150, 1), (0, 0, 0), "floor")
+    hall.add_ground("floor")
     for name, x, y in (("right", 0, -1), ("left", 0, 1), ("back", -1, 0), ("front", 1, 0)):
         half = (wide / 2 * abs(y) + 0.1, deep / 2 * abs(x) + 0.1, _SHELF)
         center = (x * (wide / 2 + 0.1), y * (deep / 2 + 0.1), _SHELF)

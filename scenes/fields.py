@@ -47,7 +47,7 @@ class HillsOptions(SceneOptions):
 def hills(land: "Draft") -> None:
     """Round hills about a level middle, in one height field, and boulders on them."""
     options: HillsOptions = land.options
-    land.add("ground/floor", "plane", (150, 150, 1), (0, 0, 0), "grass")
+    land.add_ground("grass")
     half = np.array(options.size) / 2
     columns, rows = np.ceil(2 * half / CELL).astype(int) + 1
     x = np.linspace(-half[0], half[0], columns)

@@ -137,6 +137,10 @@ class Draft:
         sizes, places = np.array([size], float), np.array([position], float)
         self.add_all(lambda: [name], kinds, sizes, places, lambda: [material], heading, motion)
 
+    def add_ground(self, material: str, edge: float = 150.0) -> None:
+        """Add level ground, which pictures show up to so far from the origin, m."""
+        self.add("ground/floor", "plane", (edge, edge, 1), (0, 0, 0), material)
+
     def add_all(
         self,
         names: Names,
@@ -200,7 +204,7 @@ def forest(wood: Draft) -> None:
     trees, shrubs, rocks = options.counts
     green = trees + shrubs
     edge = max(150.0, wide, deep)
-    wood.add("ground/floor", "plane", (edge, edge, 1), (0, 0, 0), "ground")
+    wood.add_ground("ground", edge)
     drawn = wood.rng.random((green + rocks, 6))
     leaves = wood.choices("leaves", green)
     kinds = (drawn[:trees, 3] * len(_TREES)).astype(int)
@@ -339,7 +343,7 @@ def gates(track: Draft) -> None:
 
     All but the ground has the scale of the scene.
     """
-    track.add("ground/floor", "plane", (150, 150, 1), (0, 0, 0), "grass")
+    track.add_ground("grass")
     for i in range(_GATES):
         _add_gate(track, i)
     for i in range(40):

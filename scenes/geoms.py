@@ -13,7 +13,7 @@ from .solids import Solids
 
 NAME = "rotorgram/solid"
 """Of a geom, before its number."""
-_SPHERE, _CAPSULE, _CYLINDER, _BOX, _PLANE, HFIELD = range(len(kernels.KINDS))
+HFIELD = kernels.KINDS.index("hfield")
 # MuJoCo's compiler notes which geoms have the axes of their body, and turns these no more.
 _TURNED = (0.8, 0.0, 0.0, 0.6)
 _AWAY = (0.0, 0.0, -1e4)  # m: where geoms lie that stand for nothing
@@ -54,32 +54,26 @@ def geoms_of(solids: Solids, count: int) -> dict[str, np.ndarray]:
     given = len(solids)
     kinds = solids.kinds
     a, b, c = solids.halves.T
-    is_plane = kinds == _PLANE
-    is_flat = (kinds == _BOX) | (kinds == HFIELD) | is_plane
-    type_ = np.full(count, mjtGeom.mjGEOM_SPHERE.value)
-    position = np.full((count, 3), _AWAY)
-    quaternion = np.tile(_TURNED, (count, 1))
-    size = np.zeros((count, 3))
-    size[:, 0] = 0.1
-    type_[:given] = np.array([one.value for one in GEOM_TYPES])[kinds]
     lows = np.array([least_of(grid) for grid in solids.grids])
+    type_ = np.full(count, mjtGeom.mjGEOM_SPHERE.value)
+    type_[:given] = np.array([one.value for one in GEOM_TYPES])[kinds]
+    position = np.full((count, 3), _AWAY)
     position[:given] = solids.centers + lows[:, None] * solids.axes[:, :, 2]
+    quaternion = np.tile(_TURNED, (count, 1))
     for row, axes in zip(quaternion, solids.axes, strict=False):
         mujoco.mju_mat2Quat(row, axes.ravel())
-    second = np.where(kinds == _CAPSULE, c - a, np.where(kinds == _CYLINDER, c, b))
-    size[:given, 0] = np.where(is_plane, 0.0, a)
-    size[:given, 1] = np.where(is_plane | (kinds == _SPHERE), 0.0, second)
-    size[:given, 2] = np.where(is_flat, np.where(is_plane, 1.0, c), 0.0)
-    half = np.full((count, 3), 0.1)
-    half[:given] = solids.halves
-    furthest = half.copy()
-    furthest[:given, 2] += abs(lows)
-    reach = np.sqrt((furthest * furthest).sum(axis=1))
-    reach[:given] = np.where(kinds == _CYLINDER, np.sqrt(a * a + c * c), reach[:given])
-    reach[:given] = np.where(kinds <= _CAPSULE, c, reach[:given])
-    reach[:given][is_plane] = 0.0
-    box = np.concatenate((np.zeros((count, 3)), half), axis=1)
+    # What is chosen by kind is in the order of `kernels.KINDS`.
+    size = np.tile((0.1, 0.0, 0.0), (count, 1))
+    size[:given, 0] = np.choose(kinds, (a, a, a, a, 0.0, a))
+    size[:given, 1] = np.choose(kinds, (0.0, c - a, c, b, 0.0, b))
+    size[:given, 2] = np.choose(kinds, (0.0, 0.0, 0.0, c, 1.0, c))
+    deep = c + abs(lows)
+    furthest = np.sqrt(a * a + b * b + deep * deep)
+    reach = np.full(count, 0.1)
+    reach[:given] = np.choose(kinds, (c, c, np.sqrt(a * a + c * c), furthest, 0.0, furthest))
+    box = np.tile((0.0, 0.0, 0.0, 0.1, 0.1, 0.1), (count, 1))
     box[:given, 2] = -lows
+    box[:given, 3:] = solids.halves
     return {
         "geom_type": type_, "geom_pos": position, "geom_quat": quaternion, "geom_size": size,
         "geom_rbound": reach, "geom_aabb": box,

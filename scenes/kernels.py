@@ -12,11 +12,13 @@ x and along y, the cosine of its steepest slope, and its heights above its cente
 """
 
 from collections.abc import Callable
-from functools import cache
+from functools import cache, partial
 from types import FunctionType
 from typing import Any, NamedTuple
 
 import numpy as np
+
+from ..models.matrices import cross, dot
 
 KINDS = ("sphere", "capsule", "cylinder", "box", "plane", "hfield")
 """Capsule and cylinder stand along their third axis. That of a plane is its normal: what lies
@@ -51,6 +53,10 @@ Numba = Any
 """What Numba gives and takes, which has no types."""
 Options = dict[str, Any]
 
+_root = np.sqrt
+_down = np.floor
+_index = np.int64
+
 
 # ---- what formulas are made of: here for arrays, in `compiled` for numbers
 
@@ -65,26 +71,6 @@ def _most(a: Array, b: Array) -> Array:
 
 def _pick(flag: Array, yes: Array, no: Array) -> Array:
     return np.where(flag, yes, no)
-
-
-def _root(x: Array) -> Array:
-    return np.sqrt(x)
-
-
-def _down(x: Array) -> Array:
-    return np.floor(x)
-
-
-def _index(x: Array) -> Array:
-    return np.asarray(x).astype(np.int64)
-
-
-def _all(flag: Array) -> Array:
-    return np.all(flag)
-
-
-def _dot(a: Vector, b: Vector) -> Array:
-    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
 def _nonzero(x: Array) -> Array:
@@ -102,7 +88,7 @@ def _sphere(ray: Vector, solid: Array) -> Array:
 
 def _ball(ray: Vector, center: Vector, radius: Array) -> Array:
     """By the ray's nearest point: a difference of large squares would be lost."""
-    along = _dot(ray, center)
+    along = dot(ray, center)
     x = center[0] - along * ray[0]
     y = center[1] - along * ray[1]
     z = center[2] - along * ray[2]
@@ -111,22 +97,22 @@ def _ball(ray: Vector, center: Vector, radius: Array) -> Array:
     return along - half, along + half, square >= _ZERO
 
 
-def _side(ray: Vector, middle: Vector, radius: Array) -> Array:
-    """Of the endless cylinder about the third axis, as `_ball`."""
-    x, y, _ = ray
+def _side(ray: Vector, solid: Array) -> Array:
+    """The ray along the axes; of the endless cylinder about the third axis, as `_ball`."""
+    _, u, v, axis, middle, size = solid
+    x, y, z = dot(ray, u) + _NUDGE, dot(ray, v), dot(ray, axis)
     scale = _ONE / (x * x + y * y)
     along = (x * middle[0] + y * middle[1]) * scale
     p = middle[0] - along * x
     q = middle[1] - along * y
-    square = radius * radius - (p * p + q * q)
+    square = size[0] * size[0] - (p * p + q * q)
     half = _root(_most(square, _ZERO) * scale)
-    return along - half, along + half, square >= _ZERO
+    return (x, y, z), along - half, along + half, square >= _ZERO
 
 
 def _cylinder(ray: Vector, solid: Array) -> Array:
-    _, u, v, axis, middle, size = solid
-    local = (_dot(ray, u) + _NUDGE, _dot(ray, v), _dot(ray, axis))
-    enters, leaves, meets = _side(local, middle, size[0])
+    local, enters, leaves, meets = _side(ray, solid)
+    _, _, _, _, middle, size = solid
     steep = _ONE / _nonzero(local[2])
     low = (middle[2] - size[2]) * steep
     high = (middle[2] + size[2]) * steep
@@ -137,11 +123,10 @@ def _cylinder(ray: Vector, solid: Array) -> Array:
 
 def _capsule(ray: Vector, solid: Array) -> Array:
     """Where the ray crosses the side beyond an end, the ball there decides."""
-    _, u, v, axis, middle, size = solid
+    local, enters, leaves, meets = _side(ray, solid)
+    _, _, _, _, middle, size = solid
     radius = size[0]
     height = size[3]
-    local = (_dot(ray, u) + _NUDGE, _dot(ray, v), _dot(ray, axis))
-    enters, leaves, meets = _side(local, middle, radius)
     first = enters * local[2] - middle[2]
     last = leaves * local[2] - middle[2]
     start = middle[2] + _pick(first > _ZERO, height, -height)
@@ -157,9 +142,9 @@ def _capsule(ray: Vector, solid: Array) -> Array:
 def _box(ray: Vector, solid: Array) -> Array:
     """By slabs: Kay and Kajiya, Ray tracing complex scenes, SIGGRAPH 1986."""
     _, u, v, axis, middle, size = solid
-    x = _ONE / _nonzero(_dot(ray, u))
-    y = _ONE / _nonzero(_dot(ray, v))
-    z = _ONE / _nonzero(_dot(ray, axis))
+    x = _ONE / _nonzero(dot(ray, u))
+    y = _ONE / _nonzero(dot(ray, v))
+    z = _ONE / _nonzero(dot(ray, axis))
     a, b, c = middle[0] * x, middle[1] * y, middle[2] * z
     p, q, r = abs(x) * size[0], abs(y) * size[1], abs(z) * size[2]
     enters = _most(_most(a - p, b - q), c - r)
@@ -170,7 +155,7 @@ def _box(ray: Vector, solid: Array) -> Array:
 def _plane(ray: Vector, solid: Array) -> Array:
     """From above alone."""
     _, _, _, axis, middle, _ = solid
-    down = _dot(ray, axis)
+    down = dot(ray, axis)
     met = middle[2] / _least(down, -_TINY)
     return met, met, down < -_TINY
 
@@ -210,8 +195,8 @@ def _hfield(ray: Vector, solid: Array) -> Array:
     wide = (_number(table, j, _ZERO) - _ONE) / (size[0] + size[0])
     deep = (_number(table, j, _ONE) - _ONE) / (size[1] + size[1])
     x, y = (size[0] - middle[0]) * wide, (size[1] - middle[1]) * deep
-    along, across = _dot(ray, u) * wide, _dot(ray, v) * deep
-    line = (x, y, -middle[2], along, across, _dot(ray, axis))
+    along, across = dot(ray, u) * wide, dot(ray, v) * deep
+    line = (x, y, -middle[2], along, across, dot(ray, axis))
     enters, leaves, meets = _box(ray, seen)
     leaves = _least(leaves, reach)
     start = _most(enters, _ZERO)
@@ -235,7 +220,7 @@ def _hfield(ray: Vector, solid: Array) -> Array:
         met = _pick(crosses, t + (end - t) * (gap / _nonzero(gap - after)), met)
         hits = hits | crosses
         ended = ended | crosses | (end >= leaves)
-        if _all(ended):
+        if np.all(ended):
             break
         first = _pick(one <= end, first + stride, first)
         second = _pick(two <= end, second + step, second)
@@ -282,6 +267,10 @@ def _three(table: Array, first: int, j: Array) -> Vector:
     return table[first, j], table[first + 1, j], table[first + 2, j]
 
 
+def _along(vector: Vector, u: Vector, v: Vector, axis: Vector) -> Vector:
+    return dot(vector, u), dot(vector, v), dot(vector, axis)
+
+
 def _turned(m: Array, vector: Vector) -> Vector:
     """A vector of the world in the frame of a sensor, by the columns of its attitude."""
     x, y, z = vector
@@ -301,7 +290,7 @@ def _seen(table: Array, j: Array, place: Array, attitude: Array) -> Array:
     u = _turned(attitude, _three(table, _U, j))
     v = _turned(attitude, _three(table, _V, j))
     axis = _turned(attitude, _three(table, _AXIS, j))
-    middle = (_dot(center, u), _dot(center, v), _dot(center, axis))
+    middle = _along(center, u, v, axis)
     a, b, c = _three(table, _SIZE, j)
     return center, u, v, axis, middle, (a, b, c, c - table[_ROUNDING, j])
 
@@ -310,9 +299,7 @@ def _local(table: Array, j: Array, point: Vector) -> Vector:
     """A point from the center of a primitive, along its axes."""
     x, y, z = _three(table, _CENTER, j)
     away = (point[0] - x, point[1] - y, point[2] - z)
-    along = _dot(away, _three(table, _U, j))
-    across = _dot(away, _three(table, _V, j))
-    return along, across, _dot(away, _three(table, _AXIS, j))
+    return _along(away, _three(table, _U, j), _three(table, _V, j), _three(table, _AXIS, j))
 
 
 def _gap(kind: Array, table: Array, j: Array, point: Vector, radius: Array) -> Array:
@@ -370,28 +357,24 @@ def _minus(a: Vector, b: Vector) -> Vector:
     return a[0] - b[0], a[1] - b[1], a[2] - b[2]
 
 
-def _cross(a: Vector, b: Vector) -> Vector:
-    return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
-
-
 def _triangle(p: Vector, q: Vector, r: Vector) -> Array:
     """Square of the distance of the origin."""
     first, second, third = _minus(q, p), _minus(r, q), _minus(p, r)
-    normal = _cross(first, third)
-    across = _dot(normal, p)
-    is_before = _dot(_cross(first, normal), p) <= _ZERO
-    is_beside = _dot(_cross(second, normal), q) <= _ZERO
-    is_behind = _dot(_cross(third, normal), r) <= _ZERO
+    normal = cross(first, third)
+    across = dot(normal, p)
+    is_before = dot(cross(first, normal), p) <= _ZERO
+    is_beside = dot(cross(second, normal), q) <= _ZERO
+    is_behind = dot(cross(third, normal), r) <= _ZERO
     edge = _least(_edge(p, first), _least(_edge(q, second), _edge(r, third)))
-    flat = across * across / _dot(normal, normal)
+    flat = across * across / dot(normal, normal)
     return _pick(is_before & is_beside & is_behind, flat, edge)
 
 
 def _edge(start: Vector, way: Vector) -> Array:
     """Square of the distance of the origin from a line that leads a way from its start."""
-    share = _least(_most(-_dot(start, way) / _dot(way, way), _ZERO), _ONE)
+    share = _least(_most(-dot(start, way) / dot(way, way), _ZERO), _ONE)
     near = (start[0] + share * way[0], start[1] + share * way[1], start[2] + share * way[2])
-    return _dot(near, near)
+    return dot(near, near)
 
 
 def distances(kinds: Array, table: Array, points: Array) -> Array:
@@ -406,7 +389,7 @@ def distances(kinds: Array, table: Array, points: Array) -> Array:
     return nearest
 
 
-def _nearest(kinds: Array, table: Array, x: Array, y: Array, z: Array) -> Array:
+def _nearest(kinds: Array, table: Array, point: Vector) -> Array:
     """From a point to the nearest primitive of a layout but the first, the ground, m; 1e30 if there
     is none.
     """
@@ -417,32 +400,28 @@ def _nearest(kinds: Array, table: Array, x: Array, y: Array, z: Array) -> Array:
     for j in range(1, kinds.size):
         kind = kinds[j]
         if others == 0:  # decided before the loop, which becomes vectors
-            nearest = _least(nearest, _gap(kind, table, j, (x, y, z), table[_ROUNDING, j]))
+            nearest = _least(nearest, _gap(kind, table, j, point, table[_ROUNDING, j]))
         elif kind == _HFIELD:
-            nearest = _least(nearest, _gap_of_hfield(table, j, (x, y, z)))
+            nearest = _least(nearest, _gap_of_hfield(table, j, point))
         elif kind < _HFIELD:
-            nearest = _least(nearest, _gap(kind, table, j, (x, y, z), table[_ROUNDING, j]))
+            nearest = _least(nearest, _gap(kind, table, j, point, table[_ROUNDING, j]))
     return nearest
 
 
-def _first(
-    kinds: Array, table: Array, x: Array, y: Array, z: Array, dx: Array, dy: Array, dz: Array
-) -> Array:
+def _first(kinds: Array, table: Array, point: Vector, ray: Vector) -> Array:
     """Along a ray from a point to the first primitive but the ground, m; 1e30 if there is none."""
     found = _BIG
-    ray = (dx, dy, dz)
     for j in range(1, kinds.size):
         if kinds[j] < REST:
-            solid = _seen(table, j, (x, y, z), _UNTURNED)
-            enters, leaves, meets = _met(kinds[j], ray, solid, table, j, _BIG)
-            found = _nearer(found, enters, leaves, meets)
+            solid = _seen(table, j, point, _UNTURNED)
+            found = _nearer(found, *_met(kinds[j], ray, solid, table, j, _BIG))
     return found
 
 
 def first_by_numpy(kinds: Array, table: Array, point: Array, ray: Array) -> Array:
     """As `_first`, of a point and a direction, (3,)."""
     with np.errstate(all="ignore"):
-        return _first(kinds, table, *point, *ray)
+        return _first(kinds, table, point, ray)
 
 
 def _gaps(kinds: Array, tables: Array, which: Array, points: Array, due: Array, out: Array) -> None:
@@ -453,8 +432,8 @@ def _gaps(kinds: Array, tables: Array, which: Array, points: Array, due: Array, 
     for w in range(out.shape[0]):
         for a in range(out.shape[1]):
             if due[w, a]:
-                x, y, z = points[w, a, 0], points[w, a, 1], points[w, a, 2]
-                out[w, a] = _nearest(kinds[which[w]], tables[which[w]], x, y, z)
+                point = (points[w, a, 0], points[w, a, 1], points[w, a, 2])
+                out[w, a] = _nearest(kinds[which[w]], tables[which[w]], point)
 
 
 def gaps_by_numpy(
@@ -468,7 +447,7 @@ def gaps_by_numpy(
 
 def _nearest_at(count: int, kinds: Numba, table: Numba, x: Array, y: Array, z: Array) -> Array:
     """As `_nearest`, by the addresses of the kinds and of the table of so many primitives."""
-    return _nearest(_array(kinds, (count,)), _array(table, (ROWS, count)), x, y, z)
+    return _nearest(_array(kinds, (count,)), _array(table, (ROWS, count)), (x, y, z))
 
 
 def _first_at(
@@ -483,7 +462,8 @@ def _first_at(
     dz: Array,
 ) -> Array:
     """As `_first`, by such addresses."""
-    return _first(_array(kinds, (count,)), _array(table, (ROWS, count)), x, y, z, dx, dy, dz)
+    layout = _array(kinds, (count,)), _array(table, (ROWS, count))
+    return _first(*layout, (x, y, z), (dx, dy, dz))
 
 
 _array: Numba = None  # of an address: in `compiled` alone
@@ -512,7 +492,7 @@ def _packets(
         out: (W, N).
     """
     far = np.empty(kinds.shape[1], np.float32)
-    aside = np.empty(15, np.float32)
+    normals = np.empty((5, 3), np.float32)
     hits = np.empty((planes.shape[0], LANES), np.int32)
     hit = hits.reshape(-1)
     found = np.empty((directions.shape[0], LANES), np.float32)
@@ -523,32 +503,33 @@ def _packets(
         found[:] = reach
         _ranges(table, place[w], far)
         if whole.shape[0]:
+            turn = attitude[w]
             for f in range(5):
-                aside[f], aside[5 + f], aside[10 + f] = _turned_back(attitude[w], whole[f])
-            _hide(table, place[w], aside, far)
+                own = _along(whole[f], turn[:3], turn[3:6], turn[6:])
+                normals[f, 0], normals[f, 1], normals[f, 2] = own
+            _hide(table, place[w], normals, far)
         for j in range(kind.size):
             if far[j] > reach + _MARGIN or kind[j] == REST:
                 continue
             solid = _seen(table, j, place[w], attitude[w])
-            if kind[j] == _PLANE:
+            if kind[j] < _BOX:
+                _look(_depth_of_round, planes, solid, hits)
+            elif kind[j] == _PLANE:
                 hits[:] = 1
-                _meet(_plane, solid, hit, directions, found)
-                continue
-            if kind[j] == _BOX:
+            else:
                 _look(_depth, planes, solid, hits)
-                _meet(_box, solid, hit, directions, found)
-                continue
-            if kind[j] == _HFIELD:
-                _look(_depth, planes, solid, hits)
-                _meet_hfield((solid, table, j, reach), hit, directions, found)
-                continue
-            _look(_depth_of_round, planes, solid, hits)
             if kind[j] == _SPHERE:
                 _meet(_sphere, solid, hit, directions, found)
             elif kind[j] == _CAPSULE:
                 _meet(_capsule, solid, hit, directions, found)
-            else:
+            elif kind[j] == _CYLINDER:
                 _meet(_cylinder, solid, hit, directions, found)
+            elif kind[j] == _BOX:
+                _meet(_box, solid, hit, directions, found)
+            elif kind[j] == _PLANE:
+                _meet(_plane, solid, hit, directions, found)
+            else:
+                _meet_hfield((solid, table, j, reach), hit, directions, found)
         for i in range(slots.size):
             out[w, i] = flat[slots[i]]
 
@@ -556,51 +537,35 @@ def _packets(
 def _ranges(table: Array, place: Array, far: Array) -> None:
     """Distances of a point to the boxes about primitives."""
     for j in range(far.size):
-        along, across, up = _local(table, j, (place[0], place[1], place[2]))
-        a = _most(abs(along) - table[_SIZE, j], _ZERO)
-        b = _most(abs(across) - table[_SIZE + 1, j], _ZERO)
-        c = _most(abs(up) - table[_SIZE + 2, j], _ZERO)
-        far[j] = _root(a * a + b * b + c * c)
-
-
-def _turned_back(m: Array, vector: Array) -> Vector:
-    """A vector of a sensor's frame in the world."""
-    x, y, z = vector[0], vector[1], vector[2]
-    return (
-        m[0] * x + m[1] * y + m[2] * z,
-        m[3] * x + m[4] * y + m[5] * z,
-        m[6] * x + m[7] * y + m[8] * z,
-    )
+        far[j] = _gap(_BOX, table, j, (place[0], place[1], place[2]), _ZERO)
 
 
 def _hide(table: Array, place: Array, normals: Array, far: Array) -> None:
-    """Set the distances of what lies behind one of five planes through a point: x of all normals,
-    then y, then z, in the world.
+    """Set the distances of what lies behind one of five planes through a point, with normals in the
+    world, (5, 3).
     """
     for j in range(far.size):
         x, y, z = _three(table, _CENTER, j)
         center = (x - place[0], y - place[1], z - place[2])
         u, v, axis = _three(table, _U, j), _three(table, _V, j), _three(table, _AXIS, j)
+        solid = (center, u, v, axis, center, _three(table, _SIZE, j))
         worst = _BIG
         for f in range(5):
-            normal = (normals[f], normals[5 + f], normals[10 + f])
-            depth = _dot(normal, center) + table[_SIZE, j] * abs(_dot(normal, u))
-            depth += table[_SIZE + 1, j] * abs(_dot(normal, v))
-            worst = _least(worst, depth + table[_SIZE + 2, j] * abs(_dot(normal, axis)))
+            worst = _least(worst, _depth(normals[f], solid))
         far[j] = _pick(worst >= -_MARGIN, far[j], _BIG)
 
 
 def _depth(normal: Vector, solid: Array) -> Array:
     """How far the box about a primitive reaches along a normal."""
     center, u, v, axis, _, size = solid
-    sides = size[0] * abs(_dot(normal, u)) + size[1] * abs(_dot(normal, v))
-    return _dot(normal, center) + (sides + size[2] * abs(_dot(normal, axis)))
+    sides = size[0] * abs(dot(normal, u)) + size[1] * abs(dot(normal, v))
+    return dot(normal, center) + (sides + size[2] * abs(dot(normal, axis)))
 
 
 def _depth_of_round(normal: Vector, solid: Array) -> Array:
     """The same of what is round about its third axis, quicker; of a cylinder somewhat more."""
     center, _, _, axis, _, size = solid
-    return _dot(normal, center) + (size[0] + size[3] * abs(_dot(normal, axis)))
+    return dot(normal, center) + (size[0] + size[3] * abs(dot(normal, axis)))
 
 
 def _look(depth: Function, planes: Array, solid: Array, hits: Array) -> None:
@@ -630,8 +595,7 @@ def _meet_hfield(solid: Array, hit: Array, directions: Array, found: Array) -> N
 def _shorten(formula: Function, solid: Array, d: Array, t: Array) -> None:
     for i in range(LANES):
         ray = (d[i], d[LANES + i], d[2 * LANES + i])
-        enters, leaves, meets = formula(ray, solid)
-        t[i] = _nearer(t[i], enters, leaves, meets)
+        t[i] = _nearer(t[i], *formula(ray, solid))
 
 
 def by_numpy(
@@ -685,55 +649,67 @@ def _one_instruction() -> Function:
     return least
 
 
+class Maker:
+    """Makes code of the functions of a module. Raises `ImportError` without Numba.
+
+    Attributes:
+        names: What code calls: functions of the module, which are inlined.
+    """
+
+    def __init__(self, module: Options) -> None:
+        from numba import njit
+        from numba.core.cpu import CPUTargetOptions
+        from numba.core.options import TargetOptions
+
+        # No array overlaps another one: Numba can be told so, but has no public option for it.
+        mapping: Function = TargetOptions.Mapping
+        setattr(CPUTargetOptions, "noalias", mapping("noalias"))  # noqa: B010
+        options: Options = {"error_model": "numpy", "boundscheck": False, "nogil": True}
+        self.compile: Function = partial(njit, **options)
+        inline = self.compile(forceinline=True, noalias=True)
+        self.names = dict(module)
+        for name, function in module.items():
+            if isinstance(function, FunctionType):
+                self.names[name] = inline(self.own(function))
+        self.names["_least"] = _one_instruction()
+        self.names["_most"] = inline(lambda a, b: a if a > b else b)
+        self.names["_pick"] = inline(lambda flag, yes, no: yes if flag else no)
+
+    def own(self, function: Function) -> Function:
+        """Its code, which calls what `names` has."""
+        return FunctionType(function.__code__, self.names)
+
+    def made(self, kinds: str, function: Function) -> Function:
+        """Code that takes arguments of these kinds, and returns nothing."""
+        made: Function = self.compile(f"void({kinds})", cache=True)(self.own(function))
+        return made
+
+
 @cache
 def compiled() -> Compiled | None:
     """Kernels by Numba, or None where it is not installed: the extra `fast` brings it."""
     try:
-        import numba
-        from numba import cfunc, njit, types
-        from numba.core.cpu import CPUTargetOptions
-        from numba.core.options import TargetOptions
+        maker = Maker(globals())
     except ImportError:
         return None
-    # No array overlaps another one: Numba can be told so, but has no public option for it.
-    mapping: Function = TargetOptions.Mapping
-    setattr(CPUTargetOptions, "noalias", mapping("noalias"))  # noqa: B010
-    options: Options = {"error_model": "numpy", "boundscheck": False, "nogil": True}
+    import numba
+    from numba import cfunc, types
 
-    inner: Options = {**options, "forceinline": True, "noalias": True}
-    inline: Function = njit(**inner)
-    names: Options = dict(globals())
-
-    def own(function: Function) -> Function:
-        """Its code, which calls what `names` has."""
-        return FunctionType(function.__code__, names)
-
-    for name, function in globals().items():
-        if isinstance(function, FunctionType):
-            names[name] = inline(own(function))
-    names["_least"] = _one_instruction()
-    names["_most"] = inline(lambda a, b: a if a > b else b)
-    names["_pick"] = inline(lambda flag, yes, no: yes if flag else no)
-    names["_root"] = inline(lambda x: np.sqrt(x))
-    names["_down"] = inline(lambda x: np.floor(x))
-    names["_index"] = inline(lambda x: int(x))
-    names["_all"] = inline(lambda flag: flag)
     for large in (_gap_of_hfield, _meet_hfield):  # inlined, they would slow the others
-        names[large.__name__] = njit(**options)(own(large))
+        maker.names[large.__name__] = maker.compile()(maker.own(large))
     table, row, numbers = "f4[:,:,::1]", "i8[::1]", "f4[:,::1]"
-    kinds = ["int8[:,::1]", table, row, *[numbers] * 5, "u8[::1]", "f4", numbers]
-    whole: Options = {**options, "cache": True}
-    packets = njit(f"void({','.join(kinds)})", **whole)(own(_packets))
-    kinds = ["int8[:,::1]", table, row, table, "b1[:,::1]", numbers]
-    gaps = njit(f"void({','.join(kinds)})", **whole)(own(_gaps))
-    names["_array"] = vars(numba)["carray"]
+    rays = ["int8[:,::1]", table, row, *[numbers] * 5, "u8[::1]", "f4", numbers]
+    packets = maker.made(",".join(rays), _packets)
+    points = ["int8[:,::1]", table, row, table, "b1[:,::1]", numbers]
+    gaps = maker.made(",".join(points), _gaps)
+    maker.names["_array"] = vars(numba)["carray"]
     number = types.float32
     pointer: Numba = types.CPointer
 
     def by_address(function: Function, count: int) -> Numba:
         """A function of C of a layout and so many further numbers."""
         kind = number(types.int64, pointer(types.int8), pointer(number), *[number] * count)
-        return cfunc(kind, cache=True)(own(function))
+        return cfunc(kind, cache=True)(maker.own(function))
 
     nearest, first = owners = by_address(_nearest_at, 3), by_address(_first_at, 6)
     return Compiled(packets, gaps, nearest.address, first.address, owners)

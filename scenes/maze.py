@@ -53,7 +53,7 @@ def maze(draft: "Draft") -> None:
     half = CELL / 2 * np.array([columns, rows])
     wide, deep = half.tolist()
     edge = 2 * max(wide, deep)
-    draft.add("ground/floor", "plane", (edge, edge, 1), (0, 0, 0), "floor")
+    draft.add_ground("floor", edge)
     for name, x, y in (
         ("east", wide, 0),
         ("north", 0, deep),

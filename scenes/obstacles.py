@@ -86,8 +86,8 @@ class Obstacle:
     @property
     def is_ground(self) -> bool:
         """Whether it is level ground at z = 0 or below, which is in every scene."""
-        _, x, y, _ = self.attitude
-        return self.kind == "plane" and x == y == 0.0 and self.position[2] <= 0.0
+        is_level = self.quaternion[1:3] == (0.0, 0.0)
+        return self.kind == "plane" and is_level and self.position[2] <= 0.0
 
 
 def to_content(obstacles: Iterable[Obstacle]) -> str:

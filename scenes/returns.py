@@ -6,12 +6,11 @@ As in `kernels`, a formula is there once: NumPy runs it on arrays, Numba compile
 from collections.abc import Callable
 from functools import cache
 from statistics import NormalDist
-from types import FunctionType
 from typing import NamedTuple
 
 import numpy as np
 
-from .kernels import Array, Function, Options, _least, _pick
+from .kernels import Array, Maker, _least, _pick
 
 RANGES = ("depth", "lidar", "tof")
 """Kinds of sensors with rays, and their names among observations."""
@@ -94,12 +93,8 @@ def _reading(distance: Array, word: Array, level: Array, is_edge: Array, errors:
     sigma = errors[2] + distance * (errors[3] + distance * errors[4])
     value = distance + sigma * level
     chance = _pick(is_edge, errors[6], errors[5])
-    missing = (distance >= errors[1]) | (value < errors[0]) | (_share(word) < chance)
+    missing = (distance >= errors[1]) | (value < errors[0]) | (np.float32(word >> _BITS) < chance)
     return _pick(missing, errors[1], _least(value, errors[1]))
-
-
-def _share(word: Array) -> Array:
-    return (word >> _BITS).astype(np.float32)
 
 
 def _jumps(a: Array, b: Array) -> Array:
@@ -194,25 +189,11 @@ class Compiled(NamedTuple):
 def compiled() -> Compiled | None:
     """Kernels by Numba, or None where it is not installed."""
     try:
-        from numba import njit
+        maker = Maker(globals())
     except ImportError:
         return None
-    options: Options = {"error_model": "numpy", "boundscheck": False, "nogil": True}
-    inline: Function = njit(**options, forceinline=True)
-    names: Options = dict(globals())
-    names["_least"] = inline(lambda a, b: a if a < b else b)
-    names["_pick"] = inline(lambda flag, yes, no: yes if flag else no)
-    names["_share"] = inline(lambda word: np.float32(word >> _BITS))
-    for function in (_jumps, _word, _reading):
-        names[function.__name__] = inline(FunctionType(function.__code__, names))
-
-    def made(kinds: str, function: Callable[..., None]) -> Callable[..., None]:
-        whole = njit(f"void({kinds})", cache=True, **options)
-        code: Callable[..., None] = whole(FunctionType(function.__code__, names))
-        return code
-
     rows = "f4[:,::1]"
     return Compiled(
-        made(f"{rows},f4[::1],i4[:,::1],u4[:,::1],f4[::1],{rows}", _readings),
-        made("u4[:,::1],u8,u4[::1],u4[::1],u4[:,::1]", _words),
+        maker.made(f"{rows},f4[::1],i4[:,::1],u4[:,::1],f4[::1],{rows}", _readings),
+        maker.made("u4[:,::1],u8,u4[::1],u4[::1],u4[:,::1]", _words),
     )

@@ -30,7 +30,7 @@ Array = NDArray[np.float64]
 
 MAX_CELLS = 1 << 26
 """Most cells of a grid, which takes 0.5 GB then."""
-_SPHERE, _CAPSULE, _CYLINDER, _, _PLANE, _HFIELD = range(len(kernels.KINDS))
+_CYLINDER, _HFIELD = map(kernels.KINDS.index, ("cylinder", "hfield"))
 _SIZE = Limits(1e-4, 1e4, "m")
 _ENDLESS = 1e6  # m: half the width of a plane
 _SHEET = 5e-4  # m: half the thickness of a plane of a size, which lies below its face
@@ -403,14 +403,11 @@ def _field_of(model: MjModel, geom: int) -> tuple[float, Array]:
 
 def _halves(kinds: NDArray[np.int8], sizes: Array) -> Array:
     """Half the sides of boxes about primitives of sizes as MuJoCo has them, m, (n, 3)."""
-    halves = sizes.copy()
-    a, b, c = halves.T  # views
-    is_round = kinds <= _CYLINDER
-    c[:] = np.where(is_round, b + np.where(kinds == _CAPSULE, a, 0.0), c)
-    b[:] = np.where(is_round, a, b)
-    c[:] = np.where(kinds == _SPHERE, a, c)
-    halves[kinds == _PLANE] = _ENDLESS, _ENDLESS, 0.0
-    return halves
+    a, b, c = sizes.T
+    x = np.choose(kinds, (a, a, a, a, _ENDLESS, a))  # in the order of `kernels.KINDS`
+    y = np.choose(kinds, (a, a, a, b, _ENDLESS, b))
+    z = np.choose(kinds, (a, a + b, b, c, 0.0, c))
+    return np.column_stack((x, y, z))
 
 
 @lru_cache(maxsize=256)

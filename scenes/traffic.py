@@ -31,7 +31,7 @@ class TrafficOptions(SceneOptions):
 
 def traffic(field: "Draft") -> None:
     """Balls are thrown at the place 2 m above the origin, and posts cross it."""
-    field.add("ground/floor", "plane", (150, 150, 1), (0, 0, 0), "grass")
+    field.add_ground("grass")
     for i in range(_POSTS):
         angle = field.uniform(0.0, 2 * math.pi)
         ahead = (math.cos(angle), math.sin(angle))

@@ -6,6 +6,7 @@ take arrays with the components on their last axis, and any leading axes.
 
 from collections.abc import Sequence
 
+from ..models.matrices import cross, dot
 from .elementary import atan2, cos, sin
 from .state import Array, parts_of, square_root, stack
 
@@ -16,16 +17,8 @@ Rows = tuple[Parts, Parts, Parts]
 # ---- of components
 
 
-def dot(a: Parts, b: Parts) -> Array:
-    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
-
-
 def add(a: Parts, b: Parts) -> Parts:
     return a[0] + b[0], a[1] + b[1], a[2] + b[2]
-
-
-def cross(a: Parts, b: Parts) -> Parts:
-    return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
 
 
 def times(rows: Sequence[Parts], vector: Parts) -> Parts:

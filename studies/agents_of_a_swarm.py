@@ -95,7 +95,6 @@ class Twin:
     def __init__(self, simulator: Simulator) -> None:
         self.simulator = simulator
         self.loop = Loop(EnvConfig(env_id=ENV_ID, drones=AGENTS))
-        self.taken = 0  # absences that were repeated
         self.absent = np.zeros(AGENTS, bool)
         kinds = ("coming", "waiting", "left")
         self.counts = Counter({f"absent_{kind}": 0 for kind in kinds})
@@ -110,11 +109,12 @@ class Twin:
             seed = rules.seed
             loop.advance(nothing, everybody, None if seed is None else [seed] * AGENTS)
             self.absent = ~everybody
-            self.taken = sum(one.episode < rules.episodes for one in rules.absences)
-        for absence in rules.absences[self.taken :]:
-            self.absent = self.absent | (np.arange(AGENTS) == absence.agent)
-            self.counts[f"absent_{absence.participation}"] += 1
-        self.taken = len(rules.absences)
+        for number, link in enumerate(rules.links):
+            is_new = link.participation != "flying" and not self.absent[number]
+            if is_new and not loop.out[number]:
+                self.absent[number] = True
+                came_back = link.participation == "ready"
+                self.counts[f"absent_{'coming' if came_back else link.participation}"] += 1
         if isinstance(cause, Command):
             flying = ~(self.absent | loop.out)
             for drone in range(AGENTS):

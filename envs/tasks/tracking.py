@@ -95,8 +95,10 @@ class Tracking(GoalTask):
         count = max(2, round(options.period / step))
         phases = 2 * np.pi * np.arange(count) / count
         rate = 2 * np.pi / (count * step)
-        places, self._rates = _CURVES[options.trajectory](phases, options.radius, rate)
-        self._table = places + np.array(options.center)
+        x, y, fast_x, fast_y = _CURVES[options.trajectory](cos(phases), sin(phases))
+        level = 0.0 * phases
+        self._rates = options.radius * rate * np.column_stack((fast_x, fast_y, level))
+        self._table = options.radius * np.column_stack((x, y, level)) + np.array(options.center)
         low = self._table.min(axis=0)
         high = self._table.max(axis=0)
         check_height("trajectory", low[2], self.vehicle.rest_height + options.start_band)
@@ -146,21 +148,17 @@ class Tracking(GoalTask):
         return looked_up(table, remainder(self.memory.index + ahead, len(table)))
 
 
-def _circle(phase: np.ndarray, radius: float, rate: float) -> tuple[np.ndarray, np.ndarray]:
-    """Positions from the middle, m, and velocities, m/s, shape (L, 3)."""
-    c, s, zero = cos(phase), sin(phase), 0.0 * phase
-    place = np.column_stack((c, s, zero))
-    return radius * place, radius * rate * np.column_stack((-s, c, zero))
+def _circle(c: Array, s: Array) -> tuple[Array, ...]:
+    """x and y on the curve of radius 1, and their slopes over the phase, by its cosine and sine."""
+    return c, s, -s, c
 
 
-def _lemniscate(phase: np.ndarray, radius: float, rate: float) -> tuple[np.ndarray, np.ndarray]:
-    """Bernoulli's: (cos φ, sin φ cos φ) / (1 + sin² φ)."""
-    c, s, zero = cos(phase), sin(phase), 0.0 * phase
+def _lemniscate(c: Array, s: Array) -> tuple[Array, ...]:
+    """As `_circle` of Bernoulli's: (cos φ, sin φ cos φ) / (1 + sin² φ)."""
     below = 1 + s * s
-    place = np.column_stack((c / below, s * c / below, zero))
-    x = -s * (below + 2 * c * c) / (below * below)
-    y = ((c * c - s * s) * below - 2 * s * s * c * c) / (below * below)
-    return radius * place, radius * rate * np.column_stack((x, y, zero))
+    fast_x = -s * (below + 2 * c * c) / (below * below)
+    fast_y = ((c * c - s * s) * below - 2 * s * s * c * c) / (below * below)
+    return c / below, s * c / below, fast_x, fast_y
 
 
 _CURVES = {"circle": _circle, "lemniscate": _lemniscate}

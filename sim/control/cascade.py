@@ -22,9 +22,10 @@ from functools import reduce
 import numpy as np
 
 from ... import models
+from ...models.matrices import dot
 from ..effects import EffectOptions
 from ..elementary import cos, polynomial, sin
-from ..rotations import Parts, Rows, axes_of, dot, times
+from ..rotations import Parts, Rows, axes_of, times
 from ..state import Array, WorldState, clip, interpolated, parts_of, square_root, stack
 from .gains import Gains
 

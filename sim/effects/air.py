@@ -7,7 +7,8 @@ import numpy as np
 
 from ... import models
 from ...models import InputError
-from ..rotations import Parts, Rows, add, cross, dot, matrix, product, times, transposed
+from ...models.matrices import cross, dot
+from ..rotations import Parts, Rows, add, matrix, product, times, transposed
 from ..snapshots import Kept
 from ..state import (
     Array,

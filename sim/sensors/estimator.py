@@ -5,8 +5,9 @@ from dataclasses import replace
 
 import numpy as np
 
+from ...models.matrices import cross
 from ..elementary import atan2, exp, expm1, wrapped
-from ..rotations import advanced, between, cross, to_world, world_z
+from ..rotations import advanced, between, to_world, world_z
 from ..state import Array, WorldState, chosen, clip, parts_of, stack
 from .base import FURTHEST, MAX_SPEED, UNIT, Sensor, Source
 

@@ -214,6 +214,14 @@ def test_drones_of_one_that_is_killed_hold_and_it_comes_back() -> None:
     others = [threading.Thread(target=fly_one, args=(agents[i], i, 3, seen, calm)) for i in (0, 2)]
     victim = launch(VICTIM, agents[1][1])
     with shared(agents, 3, episode_length=LONG, patience=1.0) as running:
+        rules = running.simulator.rules
+        lost: list[tuple[int, int]] = []  # episodes, and steps that were flown without the victim
+
+        def watch(cause: object) -> None:
+            if cause is not None and rules.links[1].participation != "flying":
+                lost.append((rules.episodes, rules.steps))
+
+        running.simulator.observer = watch
         for thread in others:
             thread.start()
         heard(victim, "20")
@@ -225,14 +233,13 @@ def test_drones_of_one_that_is_killed_hold_and_it_comes_back() -> None:
     for process in (victim, again):
         process.kill()
         process.communicate()
-    loss, *later = running.simulator.rules.absences
-    assert loss.agent == 1
-    assert loss.episode == 1
-    assert 20 <= loss.step < LONG - 1
-    assert loss.participation == "coming"
-    expected = in_process(3, 3, calm, (1, loss.step), episode_length=LONG)
+    episode, step = lost[0]
+    flown = step - 1
+    assert episode == 1
+    assert 20 <= flown < LONG - 1
+    expected = in_process(3, 3, calm, (1, flown), episode_length=LONG)
     assert [seen[i][0] for i in (0, 2)] == [expected[i][0] for i in (0, 2)]
-    assert all(loss.agent != 1 or loss.participation != "left" for loss in later)
+    assert lost[: LONG - flown] == [(1, step) for step in range(flown + 1, LONG + 1)]
 
 
 def test_the_command_flies_the_world_of_several_agents() -> None:

@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from math import inf
 from operator import itemgetter
-from typing import Literal, NamedTuple, Protocol
+from typing import Literal, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -56,19 +56,6 @@ Participation = Literal["coming", "ready", "flying", "waiting", "left"]
 * `waiting`: it asked for a reset, and waits for it.
 * `left`: it closed, or was silent for too long.
 """
-
-
-class Absence(NamedTuple):
-    """An agent whose drones hold until the end of an episode."""
-
-    agent: int
-    """Its number, from 0."""
-    episode: int
-    """Number of the episode, from 1 at the first State."""
-    step: int
-    """Control steps that its drones flew in that episode by its Commands."""
-    participation: Participation
-    """`waiting`: it asked for a reset while others flew on."""
 
 
 @dataclass(eq=False)
@@ -286,7 +273,6 @@ class SeveralAgents(WorldRules):
     takes part again from the next episode on.
 
     Attributes:
-        absences: Every `Absence`: with the seeds and the actions they determine each number.
         episodes: Begun so far; a reset before anything was flown begins the same episode again.
         steps: Control steps of the running episode.
         seed: Of the running episode; None: the streams of the episode before went on.
@@ -296,7 +282,6 @@ class SeveralAgents(WorldRules):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        self.absences: list[Absence] = []
         self.episodes = self.steps = 0
         self.seed: int | None = None
 
@@ -339,14 +324,9 @@ class SeveralAgents(WorldRules):
         if self.steps or not self.episodes:
             self.episodes += 1
         self.steps = 0
-        # Absences of a start that nobody flew are noted again.
-        self.absences = [absence for absence in self.absences if absence.episode < self.episodes]
-        for link in self.links:
-            if link in joining:
-                link.participation = "flying"
-                self._queue(link)
-            else:
-                self._let_go(link)
+        for link in joining:
+            link.participation = "flying"
+            self._queue(link)
 
     def _seeds(self, joining: Links) -> Seeds | None:
         """Seeds of the next episode, from the first Command of those that join; None: none came."""
@@ -398,16 +378,10 @@ class SeveralAgents(WorldRules):
         link.participation = participation
         if participation != "waiting":
             link.command = None
-        if flew:
-            self._let_go(link)
         if flew and why:
             warn(f"{link.name} is lost ({why}): its drones hold")
         if len(self._who("left")) == len(self.links):
             self.reason = why
-
-    def _let_go(self, link: AgentLink) -> None:
-        """Note that its drones hold until the end of the episode."""
-        self.absences.append(Absence(link.number, self.episodes, self.steps, link.participation))
 
     def _is_out(self, link: AgentLink) -> bool:
         """Whether all of its drones are out."""
