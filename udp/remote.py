@@ -164,8 +164,12 @@ class RemoteEnv(_Remote, gym.Env[Observation, ArrayLike]):
 
     def step(self, action: ArrayLike) -> tuple[Observation, float, bool, bool, Info]:
         """Fly for one control period. The action is sent in the dtype of its space."""
-        self._expect_flight()
-        actions = _checked_actions(action, self._dtype, self._row)[np.newaxis]
+        if not self._flying:
+            raise gym.error.ResetNeeded("step: expected a call of reset() first")
+        actions = np.asarray(action)
+        if actions.dtype != self._dtype or actions.shape != self._row:
+            actions = _checked_actions(actions, self._dtype, self._row)
+        actions = actions[np.newaxis]
         self._flying = False  # until the answer is there
         try:
             self._agent.exchange({0: (actions, _FLY, None)})

@@ -30,6 +30,7 @@ PAGES = [
     *sorted(EXAMPLES.rglob("*.md")),
     ROOT / "models" / "README.md",
 ]
+FLAG = re.compile(r"--[a-z][a-z0-9.-]*")
 FENCE = re.compile(r"^```(.*?)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 LANGUAGES = {"python", "python continued", "sh", "text", "toml", "xml", "mermaid"}
 DRAWING = ("cameras", "rotorgram.rendering", "flights.filming")
@@ -185,7 +186,7 @@ def flags_of(*command: str) -> frozenset[str]:
     page = io.StringIO()
     with redirect_stdout(page), pytest.raises(SystemExit):
         parse_command([*command, "--help"])
-    return frozenset(re.findall(r"--[a-z][a-z0-9.-]*", page.getvalue()))
+    return frozenset(FLAG.findall(page.getvalue()))
 
 
 def commands_of(block: Block) -> list[list[str]]:
@@ -270,7 +271,9 @@ def test_commands_and_flags_in_the_text_are_ones_that_there_are(
 ) -> None:
     monkeypatch.syspath_prepend(EXAMPLES)
     own = flags_of("sim", "--env", "landing:Landing-v0")
-    flags = own.union(*(flags_of(command) for command in COMMANDS))
+    capture = [sys.executable, EXAMPLES / "capture.py", "--help"]
+    shown = subprocess.run(capture, capture_output=True, text=True, check=True).stdout
+    flags = own.union(FLAG.findall(shown), *(flags_of(command) for command in COMMANDS))
     for page in PAGES:
         name = page.relative_to(ROOT).as_posix()
         for mention in re.findall(r"`([^`\n]+)`", FENCE.sub("", page.read_text(encoding="utf-8"))):

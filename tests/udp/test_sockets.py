@@ -36,7 +36,7 @@ def test_each_simulator_and_everybody_else(port: Port, others: list[socket.socke
         sock.sendto(b"%d" % sock.getsockname()[1], port.address)
     seen = set()
     for _ in others:
-        datagram, address = port.receive(1.0)
+        datagram, address = port.receive(1.0, strangers=True)
         assert int(datagram) == address[1]
         seen.add(address)
     assert seen == {sock.getsockname() for sock in others}
@@ -44,7 +44,7 @@ def test_each_simulator_and_everybody_else(port: Port, others: list[socket.socke
     one.settimeout(1)
     assert one.recvfrom(100) == (b"back", port.address)
     with pytest.raises(TimeoutError):
-        port.receive(0.01)
+        port.receive(0.01, strangers=True)
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="one socket for all elsewhere")
@@ -61,7 +61,7 @@ def test_a_flood_leaves_the_simulators_their_buffer(
     got = []
     for _ in range(10):
         with suppress(TimeoutError):
-            got.append(port.receive(0.1)[0])
+            got.append(port.receive(0.1, strangers=False)[0])
     assert got.count(b"state") == simulators
     assert got.count(bytes(500)) <= 10
 
@@ -73,10 +73,10 @@ def test_a_simulator_that_has_left_is_a_stranger_again(
     for _ in range(3):
         port.keep([one.getsockname()])
         one.sendto(b"own", port.address)
-        assert port.receive(1.0)[0] == b"own"
+        assert port.receive(1.0, strangers=False)[0] == b"own"
         port.keep([])
         one.sendto(b"any", port.address)
-        assert port.receive(1.0)[0] == b"any"
+        assert port.receive(1.0, strangers=True)[0] == b"any"
 
 
 def test_the_port_is_nobody_elses(port: Port, others: list[socket.socket]) -> None:

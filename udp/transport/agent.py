@@ -232,7 +232,7 @@ class Agent:
             before = now
             datagram = None
             try:
-                datagram, address = self._port.receive(left)
+                datagram, address = self._port.receive(left, strangers=None in slots)
             except (OSError, ValueError):  # nothing came, or an earlier one came back
                 if not self.close.alive:  # another thread has closed the env
                     raise gym.error.ClosedEnvironmentError("the env was closed") from None
@@ -346,7 +346,7 @@ def _leave(pid: int, server: Server, port: Port, journal: "Journal | None") -> N
     while (timer := server.next_timer()) is not None:
         left = max(timer - time.monotonic(), 0.0)
         with suppress(OSError):  # nothing came
-            datagram, address = port.receive(left)
+            datagram, address = port.receive(left, strangers=False)
             server.receive(datagram, address, time.monotonic())
         server.handle_timer(time.monotonic())
         _flush(server, port)

@@ -5,6 +5,7 @@ import time
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack, suppress
 from dataclasses import replace
+from functools import partial
 from math import inf
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
@@ -125,6 +126,7 @@ class Simulator(NotCopied):
                 raise InputError(f"agents: expected a different address of each, got {addresses}")
             self._port = port = Port(bind, insecure=insecure, peers=addresses)
             failing.callback(port.close)
+            self._receive = partial(port.receive, strangers=False)
             self.address: Address = port.address
             if self.address in addresses:
                 raise InputError(
@@ -223,7 +225,7 @@ class Simulator(NotCopied):
                 rules.handle_timers(before)
                 continue
             try:
-                datagram, address = self._port.receive(left)
+                datagram, address = self._receive(left)
             except OSError as error:
                 if self._port.closed:
                     raise
@@ -249,7 +251,7 @@ class Simulator(NotCopied):
                 break
             left = timer - time.monotonic()
             with suppress(OSError):  # nothing came, or an earlier datagram found nobody
-                datagram, address = self._port.receive(max(left, 0.0))
+                datagram, address = self._receive(max(left, 0.0))
                 if link := self._by_address.get(address):
                     link.client.receive(datagram, time.monotonic())
             for each in rules.links:

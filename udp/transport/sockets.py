@@ -29,7 +29,7 @@ PAUSE = 1.0
 _LOOK = 200e-6  # look of a wait before it sleeps, s: a step of one drone takes less
 _LOST = 60e-6  # time between two looks if another process had the core, s; else 2e-6
 _MAX_ASLEEP = 64  # waits at most that sleep at once before one looks again
-_STRANGERS_EVERY = 0.01  # time between two looks at strangers beside a single simulator, s
+_STRANGERS_EVERY = 0.01  # time between two looks at strangers while no slot is free, s
 _BUFFER = 1 << 22  # bytes of datagrams that a socket may hold until they are looked at
 _MAX_DATAGRAM = 65507  # largest payload of a UDP datagram over IPv4, bytes
 WAY_OUT = (
@@ -164,7 +164,9 @@ class Port:
         self.address: Address = self._everybody.getsockname()
         self._only = only
         self._own: dict[Address, Socket] = {}
+        self._simulators = selectors.DefaultSelector()
         self._all = selectors.DefaultSelector()
+        self._selectors = self._simulators, self._all
         self._all.register(self._everybody, selectors.EVENT_READ)
         self._missing = False  # whether a simulator's datagrams come to the socket for all senders
         self._next_look = 0.0
@@ -175,25 +177,29 @@ class Port:
         """Have a socket for each of these, and no others."""
         for peer in self._own.keys() - set(peers):
             sock = self._own.pop(peer)
-            self._all.unregister(sock)
+            for selector in self._selectors:
+                selector.unregister(sock)
             sock.close()
         if sys.platform == "linux":  # others sort the datagrams of one port by other rules
             for peer in set(peers) - self._own.keys():
                 self._add(peer)
         self._missing = len(self._own) < len(set(peers))
 
-    def receive(self, timeout: float) -> tuple[bytes, Address]:
-        """The next datagram and where it came from. A wait, s, may end early.
+    def receive(self, timeout: float, *, strangers: bool) -> tuple[bytes, Address]:
+        """The next datagram and where it came from.
 
-        Beside a single simulator, strangers are looked at only now and then.
+        Args:
+            timeout: Longest wait, s.
+            strangers: Wait for datagrams of strangers too. Otherwise they are looked at only now
+                and then.
 
         Raises:
-            TimeoutError, OSError: As `Socket.receive`.
+            TimeoutError, OSError: As `Socket.receive`; a wait may end early.
         """
         if self._only:
             return self._everybody.receive(timeout)
-        if len(self._own) != 1 or self._missing:
-            return self._receive_any(timeout)
+        if strangers or self._missing or not self._own:
+            return _receive_any(self._all, timeout)
         now = time.monotonic()
         if now >= self._next_look:
             self._next_look = now + _STRANGERS_EVERY
@@ -201,16 +207,10 @@ class Port:
                 return self._everybody.recvfrom(_MAX_DATAGRAM)
             except BlockingIOError:
                 pass
+        if len(self._own) > 1:
+            return _receive_any(self._simulators, timeout)
         (only,) = self._own.values()
         return only.receive(timeout)
-
-    def _receive_any(self, timeout: float) -> tuple[bytes, Address]:
-        """As `receive`, from any of several sockets: strangers come last."""
-        ready = [key.fileobj for key, _ in self._all.select(min(timeout, LONGEST_WAIT))]
-        for sock in (*self._own.values(), self._everybody):
-            if sock in ready:
-                return sock.recvfrom(_MAX_DATAGRAM)
-        raise TimeoutError
 
     def send(self, datagram: bytes, address: Address) -> None:
         """Send a datagram. Raises `OSError`."""
@@ -234,8 +234,8 @@ class Port:
     def close(self) -> None:
         """Close every socket."""
         self.keep(())
-        self._all.close()
-        self._everybody.close()
+        for each in (*self._selectors, self._everybody):
+            each.close()
 
     def _add(self, peer: Address) -> None:
         try:
@@ -254,4 +254,14 @@ class Port:
         finally:
             self._everybody.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEPORT, 0)
         self._own[peer] = sock
-        self._all.register(sock, selectors.EVENT_READ)
+        for selector in self._selectors:
+            selector.register(sock, selectors.EVENT_READ)
+
+
+def _receive_any(selector: selectors.BaseSelector, timeout: float) -> tuple[bytes, Address]:
+    """As `Socket.receive`, from any of several sockets, without looking first."""
+    for key, _ in selector.select(min(timeout, LONGEST_WAIT)):
+        assert isinstance(key.fileobj, socket.socket)
+        datagram, address = key.fileobj.recvfrom(_MAX_DATAGRAM)
+        return datagram, address
+    raise TimeoutError
