@@ -13,6 +13,9 @@ from numpy.typing import NDArray
 from .layers import Affine, Floats, Weights, orthogonal, sized
 
 Mask = NDArray[np.bool_]
+_LONGEST = 4.0
+"""Largest initial bias of an update gate: its unit forgets by a factor e in 55 steps. Units have
+biases from 0 to it, as Tallec and Ollivier 2018 (arXiv 1804.11188) spread them."""
 
 
 @dataclass(frozen=True)
@@ -61,6 +64,7 @@ class GRU(Affine):
     def initialise(self, rng: Generator, gain: float) -> None:
         super().initialise(rng, gain)
         self.recurrent[...] = orthogonal(rng, self.recurrent.shape, gain)
+        self.weight[: self.units, 0] = np.linspace(0.0, _LONGEST, self.units)
 
     def forget(self, drones: Mask) -> None:
         """Begin anew in these of the sequences of `state`, shape (B,)."""
