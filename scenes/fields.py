@@ -62,10 +62,8 @@ def hills(land: "Draft") -> None:
     middle = np.sqrt(x * x + y * y) - math.sqrt(2) * CLEARANCE
     border = np.minimum(half[0] - abs(x), half[1] - abs(y))
     heights *= np.clip(np.minimum(middle, border) / _SLOPE, 0.0, 1.0)
-    heights *= (options.height + _SUNK) / max(
-        float(heights.max()), 1e-6
-    )  # all may lie in the middle
-    heights -= _SUNK
+    highest = max(float(heights.max()), 1e-6)  # all may lie in the middle
+    heights = heights * ((options.height + _SUNK) / highest) - _SUNK
     land.add_heights("hills_0/ground", half, heights, _DEPTH, "slope")
     far = float(half.min())
     for i in range(_BOULDERS):
