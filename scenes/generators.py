@@ -6,7 +6,7 @@ World frame: z up, m. A generator draws what stands in a scene from one stream, 
 import math
 from collections.abc import Callable, Sequence
 from functools import lru_cache
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, Any, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import ArrayLike as Vector
@@ -52,9 +52,11 @@ GATES_SIZE = 50.0  # m
 _MOST_PARTS = 1 + int(_COUNTS.max())  # of a tree
 
 Names = Callable[[], Sequence[str]]
+Vectors = Array | Sequence[Vector]
+"""Three numbers, or arrays of them."""
 
 
-def about_z(headings: Array) -> Array:
+def _about_z(headings: Array) -> Array:
     """Axes that are turned, (n, 3, 3)."""
     axes = np.zeros((len(headings), 3, 3))
     axes[:, 0, 0] = axes[:, 1, 1] = settled(np.cos(headings))
@@ -75,19 +77,51 @@ class Parts(NamedTuple):
     positions: Array
     """Of their centers, m, shape (n, 3)."""
     materials: Names
-    headings: Array
-    """rad, shape (n,)."""
+    axes: Array
+    """As columns, shape (n, 3, 3)."""
     motions: Array
     """As of `motion`, shape (n, 11)."""
     grids: NDArray[np.object_]
     """As of `Solids`, shape (n,)."""
-    turned: Array | None = None
-    """Axes as columns, (n, 3, 3), in place of the headings."""
 
-    @property
-    def axes(self) -> Array:
-        """As columns, shape (n, 3, 3)."""
-        return about_z(self.headings) if self.turned is None else self.turned
+    @classmethod
+    def of(cls, drafts: "Sequence[Draft]") -> Self:
+        """Of one layout after the other."""
+        blocks = [block for draft in drafts for block in draft.blocks]
+        numbers = np.concatenate((np.empty((8, 0)), *[one.numbers for one in blocks]), axis=1)
+        count = numbers.shape[1]
+        motions = np.zeros((count, len(REST)))
+        grids = np.full(count, None)
+        first = 0
+        for one in blocks:
+            if one.motion is not REST:
+                motions[first] = one.motion
+            if one.grid is not None:
+                grids[first] = one.grid
+            first += one.numbers.shape[1]
+        return cls(
+            names=lambda: [name for one in blocks for name in one.names()],
+            kinds=numbers[0].astype(np.int8),
+            sizes=numbers[1:4].T,
+            positions=numbers[4:7].T,
+            materials=lambda: [name for one in blocks for name in one.materials()],
+            axes=_about_z(numbers[7]),
+            motions=motions,
+            grids=grids,
+        )
+
+
+class Block(NamedTuple):
+    """Parts that were added together."""
+
+    names: Names
+    numbers: Array
+    """Kind, size, position and heading, (8, n)."""
+    materials: Names
+    motion: Sequence[float] = REST
+    """Of a single part."""
+    grid: Array | None = None
+    """Likewise, as of `Solids`."""
 
 
 class Draft:
@@ -96,11 +130,21 @@ class Draft:
     def __init__(self, scene: SceneConfig, seed: int) -> None:
         self.scene = scene
         self.options = scene.values
-        self.parts: list[Parts] = []
         self.openings: list[tuple[float, ...]] = []
         """In the order in which they are passed: center, x and y of the direction, half the width,
         m."""
         self.rng = np.random.Generator(np.random.PCG64(seed))
+        self.blocks: list[Block] = []
+
+    @property
+    def count(self) -> int:
+        """Parts so far."""
+        return sum(block.numbers.shape[1] for block in self.blocks)
+
+    @property
+    def ways(self) -> Array:
+        """The openings, shape (K, 6)."""
+        return np.array(self.openings).reshape(-1, 6)
 
     def uniform(self, low: float, high: float) -> float:
         return float(self.rng.uniform(low, high))
@@ -126,16 +170,16 @@ class Draft:
         self,
         name: str,
         kind: str,
-        size: Vector,
-        position: Vector,
+        size: Vectors,
+        position: Vectors,
         material: str,
         heading: float = 0.0,
         motion: Sequence[float] = REST,
     ) -> None:
         """Add a part that is turned about z, rad, and moves as of `motion`."""
-        kinds = [KINDS.index(kind)]
-        sizes, places = np.array([size], float), np.array([position], float)
-        self.add_all(lambda: [name], kinds, sizes, places, lambda: [material], heading, motion)
+        number = KINDS.index(kind)
+        self.add_all(lambda: [name], number, size, position, lambda: [material], heading)
+        self.blocks[-1] = self.blocks[-1]._replace(motion=motion)
 
     def add_ground(self, material: str, edge: float = 150.0) -> None:
         """Add level ground, which pictures show up to so far from the origin, m."""
@@ -145,32 +189,30 @@ class Draft:
         self,
         names: Names,
         kinds: Vector,
-        sizes: Vector,
-        positions: Vector,
+        sizes: Vectors,
+        positions: Vectors,
         materials: Names,
         headings: Vector = 0.0,
-        motion: Vector = REST,
     ) -> None:
-        """Add parts; one heading may be that of all, and so may one motion."""
-        rows = np.array(positions, float)
-        own = np.array(kinds, np.int8), np.array(sizes, float)
-        turns = np.full(len(rows), headings, float)
-        motions = np.zeros((len(rows), len(REST)))
-        if motion is not REST:
-            motions[:] = motion
-        grids = np.full(len(rows), None)
-        self.parts.append(Parts(names, *own, rows, materials, turns, motions, grids))
+        """Add n parts. Sizes and positions are three numbers or arrays of n; a number is that of
+        all parts.
+        """
+        rows = np.empty((8, np.size(positions[0])))
+        rows[0] = kinds
+        rows[1], rows[2], rows[3] = sizes
+        rows[4], rows[5], rows[6] = positions
+        rows[7] = headings
+        self.blocks.append(Block(names, rows, materials))
 
     def add_heights(
-        self, name: str, half: Vector, heights: Array, depth: float, material: str
+        self, name: str, half: Array, heights: Array, depth: float, material: str
     ) -> None:
         """Add a height field about the z axis: half its width along x and along y, m; heights above
         z = 0, m, (rows, columns), and how deep it is below it, m.
         """
         center, grid = centered(heights, depth)
-        size = np.append(half, depth + center)
-        self.add(name, "hfield", size, (0, 0, center), material)
-        self.parts[-1].grids[0] = grid
+        self.add(name, "hfield", (*half, depth + center), (0, 0, center), material)
+        self.blocks[-1] = self.blocks[-1]._replace(grid=grid)
 
 
 @immutable
@@ -212,68 +254,67 @@ def forest(wood: Draft) -> None:
     tall = 9.5 + 6.5 * drawn[:trees, 0]
     spread = room * (1.4 + 1.6 * drawn[:trees, 1])
     trunk = 0.2 + 0.3 * drawn[:trees, 2]
-    aside = (0.6 * drawn[:trees, 4:] - 0.3) * spread[:, None]
+    aside = (0.6 * drawn[:trees, 4:].T - 0.3) * spread
     radii = 0.4 + 0.8 * drawn[trees:green, 0]
     sides = 0.3 + 0.7 * drawn[green:, :3]
     narrow = trunk if wood.options.clear == "ends" else 1.1 * spread
-    places = _places(wood, np.concatenate((narrow, radii, np.full(rocks, _ROCK_REACH))))
-
-    def add(what: str, kind: int, sizes: Any, heights: Array, first: int, **more: Any) -> None:
-        count = len(heights)
-        centers = np.column_stack((places[first : first + count], heights))
-        names = lambda: [what.format(i) for i in range(count)]  # noqa: E731
-        wood.add_all(names, np.full(count, kind), np.column_stack(sizes), centers, **more)
-
+    reach = np.concatenate((narrow, radii, np.full(rocks, _ROCK_REACH)))
+    x, y = _places(wood, reach)
     bark = lambda: [f"bark_{kind % 2}" for kind in kinds.tolist()]  # noqa: E731
-    add("tree_{}/trunk", CYLINDER, (trunk, 0.3 * tall, trunk), 0.3 * tall, 0, materials=bark)
-    _add_crowns(wood, kinds, tall, spread, places[:trees], aside, leaves)
-    add(
-        "shrub_{}/crown",
-        SPHERE,
-        (radii,) * 3,
-        0.1 * radii,
-        trees,
-        materials=lambda: leaves()[trees:],
-    )
-    add(
-        "rock_{}/stone", BOX, 0.8 * sides.T, 0.2 * sides[:, 2], green,
-        materials=lambda: ["stone"] * rocks, headings=math.pi * drawn[green:, 3],
+    wood.add_all(
+        lambda: [f"tree_{i}/trunk" for i in range(trees)],
+        CYLINDER, (trunk, 0.3 * tall, trunk), (x[:trees], y[:trees], 0.3 * tall), bark,
+    )  # fmt: skip
+    _add_crowns(wood, kinds, tall, spread, (x, y), aside, leaves)
+    wood.add_all(
+        lambda: [f"shrub_{i}/crown" for i in range(shrubs)],
+        SPHERE, (radii,) * 3, (x[trees:green], y[trees:green], 0.1 * radii),
+        lambda: leaves()[trees:],
+    )  # fmt: skip
+    wood.add_all(
+        lambda: [f"rock_{i}/stone" for i in range(rocks)],
+        BOX, 0.8 * sides.T, (x[green:], y[green:], 0.2 * sides[:, 2]),
+        lambda: ["stone"] * rocks, math.pi * drawn[green:, 3],
     )  # fmt: skip
 
 
 def _add_crowns(
-    wood: Draft, kinds: Array, tall: Array, spread: Array, places: Array, aside: Array,
+    wood: Draft, kinds: Array, tall: Array, spread: Array, places: Sequence[Array], aside: Array,
     leaves: Names,
 ) -> None:  # fmt: skip
     """Add the crowns of all trees; the kind of a tree says how many it has."""
     counts = _COUNTS[kinds]
     tree = np.repeat(np.arange(len(kinds)), counts)
-    first = np.repeat(np.cumsum(counts) - counts, counts)
-    row = np.repeat(_FIRSTS[kinds], counts) + np.arange(len(tree)) - first
-    shape, side, height, half_width, by_width, by_height = _CROWNS[row].T
-    radius = half_width * spread[tree]
-    half = by_width * spread[tree] + by_height * tall[tree]
+    first = np.cumsum(counts) - counts
+    row = np.arange(len(tree)) + (_FIRSTS[kinds] - first)[tree]
+    shape, side, height, half_width, by_width, by_height = _CROWNS.T[:, row]
+    wide, high = spread[tree], tall[tree]
+    radius = half_width * wide
+    half = by_width * wide + by_height * high
     half = np.where(shape == CAPSULE, np.maximum(1e-3, half - radius), half)
-    centers = np.column_stack((places[tree] + side[:, None] * aside[tree], height * tall[tree]))
+    x, y = (place[tree] + side * away[tree] for place, away in zip(places, aside, strict=True))
     wood.add_all(
         lambda: [f"tree_{i}/{_PARTS[k]}" for i, k in zip(tree.tolist(), row.tolist(), strict=True)],
-        shape, np.column_stack((radius, half, half)), centers,
+        shape, (radius, half, half), (x, y, height * high),
         lambda: list(map(leaves().__getitem__, tree.tolist())),
     )  # fmt: skip
 
 
 def _places(wood: Draft, reach: Array) -> Array:
-    """Places in the wood, (n, 2), whose circles of radius `reach` touch no clear space."""
-    half = np.array(wood.options.size) / 2
-    places = np.empty((len(reach), 2))
+    """Places in the wood, (2, n), whose circles of radius `reach` touch no clear space."""
+    wide, deep = wood.options.size
+    half = np.array([[wide / 2], [deep / 2]])
+    has_ends = wood.options.clear == "ends"
+    places = np.empty((2, len(reach)))
     left = np.arange(len(reach))
     while left.size:
-        places[left] = drawn = half * (2.0 * wood.rng.random((left.size, 2)) - 1.0)
-        x, y = abs(drawn.T)
-        room = CLEARANCE - np.maximum(x, y)
-        if wood.options.clear == "ends":
-            x = x - (half[0] - _ENDS)
+        places[:, left] = drawn = half * (2.0 * wood.rng.random((left.size, 2)).T - 1.0)
+        x, y = abs(drawn)
+        if has_ends:
+            x = x - (wide / 2 - _ENDS)
             room = _ENDS - np.sqrt(x * x + y * y)
+        else:
+            room = CLEARANCE - np.maximum(x, y)
         left = left[room > -reach[left]]
     return places
 
@@ -363,12 +404,8 @@ def gates(track: Draft) -> None:
             position = (distance * math.cos(angle), distance * math.sin(angle), height)
             size = (0.75, 9.0, height)
             track.add(f"stand_{i}/row_{row}", "box", size, position, "stand", angle)
-    ground, *others = track.parts
-    scale = track.options.scale
-    scaled = [
-        one._replace(sizes=scale * one.sizes, positions=scale * one.positions) for one in others
-    ]
-    track.parts = [ground, *scaled]
+    for block in track.blocks[1:]:
+        block.numbers[1:7] *= track.options.scale
 
 
 def _add_gate(track: Draft, number: int) -> None:
@@ -396,9 +433,9 @@ def _add_gate(track: Draft, number: int) -> None:
         track.add(f"gate_{number}/frame_{part}", "box", (0.15, half, bar), position, tint, heading)
 
 
-def parts_of(scene: SceneConfig, seed: int) -> list[Parts]:
+def parts_of(scene: SceneConfig, seed: int) -> Parts:
     """What stands in a scene, but for what its MJCF file has."""
-    return _drafted(scene, seed).parts
+    return Parts.of([drafted(scene, seed)])
 
 
 def openings_of(scene: SceneConfig, seed: int) -> Array:
@@ -406,20 +443,21 @@ def openings_of(scene: SceneConfig, seed: int) -> Array:
 
     The center, m; x and y of the direction in which it is passed; half the width, m.
     """
-    return np.array(_drafted(scene, seed).openings).reshape(-1, 6)
+    return drafted(scene, seed).ways
 
 
 @lru_cache(maxsize=4)
-def _drafted(scene: SceneConfig, seed: int) -> Draft:
+def drafted(scene: SceneConfig, seed: int) -> Draft:
+    """What is drawn in a scene from a seed. Raises `InputError`."""
     draft = Draft(scene, seed)
     draw = scene.type.draw
     if draw is None:
         return draft
     draw(draft)
     most = scene.values.most
-    count = sum(len(one.kinds) for one in draft.parts)
-    if count > most:
-        raise InputError(f"scene: expected at most {most} parts of {scene.name}, got {count}")
+    if draft.count > most:
+        got = draft.count
+        raise InputError(f"scene: expected at most {most} parts of {scene.name}, got {got}")
     return draft
 
 

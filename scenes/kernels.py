@@ -476,7 +476,7 @@ def _packets(
     kinds: Array, tables: Array, which: Array, place: Array, attitude: Array,
     directions: Array, planes: Array, whole: Array, slots: Array, reach: Array, out: Array,
 ) -> None:  # fmt: skip
-    """Distances along rays of W sensors to the first primitive, m; `reach` if there is none.
+    """Distances along rays of W sensors to the first primitive, m; to their ends if there is none.
 
     Args:
         kinds, tables: Of layouts, (S, P) and (S, 16, P).
@@ -486,13 +486,14 @@ def _packets(
         directions: Of packets of rays, unit vectors: x of the rays, then y, then z, (K, 48).
         planes: About a packet each: five normals that point inwards. So many packets side by side
             as a packet has rays, (ceil(K / 16), 240).
-        whole: Such planes about all rays, (F, 3).
+        whole: About all rays and their ends: normals, and how far inside a sensor is, m, (F, 4).
         slots: Where each ray is among those of the packets, (N,).
-        reach: float32, m.
+        reach: How far rays go, m, (K, 16).
         out: (W, N).
     """
+    furthest = reach.max()
     far = np.empty(kinds.shape[1], np.float32)
-    normals = np.empty((5, 3), np.float32)
+    bounds = whole.copy()
     hits = np.empty((planes.shape[0], LANES), np.int32)
     hit = hits.reshape(-1)
     found = np.empty((directions.shape[0], LANES), np.float32)
@@ -501,15 +502,12 @@ def _packets(
         kind = kinds[which[w]]
         table = tables[which[w]]
         found[:] = reach
-        _ranges(table, place[w], far)
+        _ranges(table, place[w], furthest, far)
         if whole.shape[0]:
-            turn = attitude[w]
-            for f in range(5):
-                own = _along(whole[f], turn[:3], turn[3:6], turn[6:])
-                normals[f, 0], normals[f, 1], normals[f, 2] = own
-            _hide(table, place[w], normals, far)
+            _turn(attitude[w], whole, bounds)
+            _hide(table, place[w], bounds, far)
         for j in range(kind.size):
-            if far[j] > reach + _MARGIN or kind[j] == REST:
+            if far[j] > _MARGIN or kind[j] == REST:
                 continue
             solid = _seen(table, j, place[w], attitude[w])
             if kind[j] < _BOX:
@@ -529,29 +527,33 @@ def _packets(
             elif kind[j] == _PLANE:
                 _meet(_plane, solid, hit, directions, found)
             else:
-                _meet_hfield((solid, table, j, reach), hit, directions, found)
+                _meet_hfield((solid, table, j, furthest), hit, directions, found)
         for i in range(slots.size):
             out[w, i] = flat[slots[i]]
 
 
-def _ranges(table: Array, place: Array, far: Array) -> None:
-    """Distances of a point to the boxes about primitives."""
+def _ranges(table: Array, place: Array, reach: Array, far: Array) -> None:
+    """Set how far primitives lie beyond the reach of rays from a place, m."""
     for j in range(far.size):
-        far[j] = _gap(_BOX, table, j, (place[0], place[1], place[2]), _ZERO)
+        far[j] = _gap(_BOX, table, j, (place[0], place[1], place[2]), _ZERO) - reach
 
 
-def _hide(table: Array, place: Array, normals: Array, far: Array) -> None:
-    """Set the distances of what lies behind one of five planes through a point, with normals in the
-    world, (5, 3).
-    """
+def _turn(m: Array, planes: Array, turned: Array) -> None:
+    """Set the normals of planes of a sensor to those in the world, by rows of its attitude."""
+    for f in range(planes.shape[0]):
+        turned[f, 0], turned[f, 1], turned[f, 2] = _along(planes[f], m[:3], m[3:6], m[6:])
+
+
+def _hide(table: Array, place: Array, bounds: Array, far: Array) -> None:
+    """Set it for what lies behind one of six planes about a place, with normals in the world."""
     for j in range(far.size):
         x, y, z = _three(table, _CENTER, j)
         center = (x - place[0], y - place[1], z - place[2])
         u, v, axis = _three(table, _U, j), _three(table, _V, j), _three(table, _AXIS, j)
         solid = (center, u, v, axis, center, _three(table, _SIZE, j))
         worst = _BIG
-        for f in range(5):
-            worst = _least(worst, _depth(normals[f], solid))
+        for f in range(6):
+            worst = _least(worst, _depth(bounds[f], solid) + bounds[f, 3])
         far[j] = _pick(worst >= -_MARGIN, far[j], _BIG)
 
 
@@ -606,10 +608,10 @@ def by_numpy(
     ray = [directions[:, first : first + LANES] for first in range(0, 3 * LANES, LANES)]
     for w in range(len(out)):
         kind, table = kinds[which[w]], tables[which[w]]
-        found = np.full(ray[0].shape, reach)
+        found = reach
         for j in np.flatnonzero(kind < REST).tolist():
             solid = _seen(table, j, place[w], attitude[w])
-            found = _nearer(found, *_met(kind[j], ray, solid, table, j, reach))
+            found = _nearer(found, *_met(kind[j], ray, solid, table, j, reach.max()))
         out[w] = found.ravel()[slots]
 
 
@@ -698,7 +700,7 @@ def compiled() -> Compiled | None:
     for large in (_gap_of_hfield, _meet_hfield):  # inlined, they would slow the others
         maker.names[large.__name__] = maker.compile()(maker.own(large))
     table, row, numbers = "f4[:,:,::1]", "i8[::1]", "f4[:,::1]"
-    rays = ["int8[:,::1]", table, row, *[numbers] * 5, "u8[::1]", "f4", numbers]
+    rays = ["int8[:,::1]", table, row, *[numbers] * 5, "u8[::1]", numbers, numbers]
     packets = maker.made(",".join(rays), _packets)
     points = ["int8[:,::1]", table, row, table, "b1[:,::1]", numbers]
     gaps = maker.made(",".join(points), _gaps)

@@ -46,11 +46,10 @@ def add_parts(spec: MjSpec, scene: SceneConfig) -> None:
     if scene.name == "warehouse":
         walls = MjSpec.from_file(str(HALL_XML))
         spec.attach(walls, prefix="warehouse/", frame=spec.worldbody.add_frame())
-    for parts in parts_of(scene, scene.seed):
-        for geom, material in zip(
-            add_geoms(spec, scene.name, parts), parts.materials(), strict=True
-        ):
-            geom.material = f"{scene.name}/{material}"
+    parts = parts_of(scene, scene.seed)
+    geoms = add_geoms(spec, scene.name, parts)
+    for geom, material in zip(geoms, parts.materials(), strict=True):
+        geom.material = f"{scene.name}/{material}"
 
 
 def add_geoms(spec: MjSpec, scene: str, parts: Parts) -> list[MjsGeom]:

@@ -71,12 +71,11 @@ def maze(draft: "Draft") -> None:
     gap = np.maximum(abs(abs(centers) - place) - reach, 0.0)
     kept = ~is_open & (np.hypot(*gap.T) >= room)
     count = int(kept.sum())
-    tall = np.full(count, _HALF_HEIGHT)
     draft.add_all(
         lambda: [f"wall_{i}/block" for i in range(count)],
-        np.full(count, KINDS.index("box")),
-        np.column_stack((reach[kept], tall)),
-        np.column_stack((centers[kept], tall)),
+        KINDS.index("box"),
+        (*reach[kept].T, _HALF_HEIGHT),
+        (*centers[kept].T, _HALF_HEIGHT),
         lambda: ["wall"] * count,
     )
 

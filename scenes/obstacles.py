@@ -146,8 +146,7 @@ def parts_of_obstacles(obstacles: Sequence[Obstacle]) -> Parts:
         sizes=sizes,
         positions=centers,
         materials=lambda: [""] * count,
-        headings=np.zeros(count),
+        axes=settled(axes),
         motions=np.zeros((count, len(REST))),
         grids=grids,
-        turned=settled(axes),
     )

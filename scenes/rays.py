@@ -20,6 +20,7 @@ Array = NDArray[np.float32]
 
 MAX_RAYS = 1 << 20
 MAX_REACH = 1e4  # m
+REACH = 20.0  # m: of rays, unless they say another one
 MAX_PLACE = 2e4  # m: further away, numbers of float32 are too coarse
 _COUNT = Limits(1, 4096, whole=True)
 _DEGREES = "degrees"
@@ -30,9 +31,11 @@ class Rays:
 
     Attributes:
         directions: Unit vectors, shape (R, C, 3).
+        reach: How far they go, m, shape (R, C).
     """
 
-    def __init__(self, directions: ArrayLike) -> None:
+    def __init__(self, directions: ArrayLike, reach: ArrayLike = REACH) -> None:
+        """`reach`: of all rays, or of each."""
         given = numbers("directions", directions)
         if given.ndim != 3 or given.shape[2] != 3 or not 0 < given.size <= 3 * MAX_RAYS:
             raise InputError(f"directions: expected shape (rows, columns, 3), got {given.shape}")
@@ -41,9 +44,16 @@ class Rays:
             raise InputError("directions: expected vectors that are not 0, got one")
         self.directions = settled(given / sizes)
         self.directions.flags.writeable = False  # packets are made of them once
+        ends = numbers("reach", reach)
+        if ends.shape not in ((), given.shape[:2]):
+            expected = f"one number or shape {given.shape[:2]}"
+            raise InputError(f"reach: expected {expected}, got {ends.shape}")
+        for end in (ends.min(), ends.max()):
+            check("reach", Limits(1e-3, MAX_REACH, "m"), float(end))
+        self.reach = np.broadcast_to(ends, given.shape[:2])
 
     @classmethod
-    def pinhole(cls, rows: int, columns: int, fov: float) -> Self:
+    def pinhole(cls, rows: int, columns: int, fov: float, reach: float = REACH) -> Self:
         """Through the centers of pixels: top row first, from left to right.
 
         `fov` is the angle between the outer edges of the first and the last column, degrees.
@@ -53,10 +63,10 @@ class Rays:
         width = 2 * np.tan(np.radians(fov) / 2) / columns
         left = (columns / 2 - (np.arange(columns) + 0.5)) * width
         up = (rows / 2 - (np.arange(rows) + 0.5)) * width
-        return cls(np.stack(np.broadcast_arrays(1.0, left, up[:, None]), axis=-1))
+        return cls(np.stack(np.broadcast_arrays(1.0, left, up[:, None]), axis=-1), reach)
 
     @classmethod
-    def rings(cls, rows: int, columns: int, low: float, high: float) -> Self:
+    def rings(cls, rows: int, columns: int, low: float, high: float, reach: float = REACH) -> Self:
         """Rings of a lidar, at elevations from `high` to `low`, degrees, the highest first; a
         single one lies in the middle.
 
@@ -70,7 +80,7 @@ class Rays:
         azimuth = 2 * np.pi * np.arange(columns) / columns
         ahead = np.cos(elevation) * np.cos(azimuth)
         left = np.cos(elevation) * np.sin(azimuth)
-        return cls(np.stack(np.broadcast_arrays(ahead, left, np.sin(elevation)), axis=-1))
+        return cls(np.stack(np.broadcast_arrays(ahead, left, np.sin(elevation)), axis=-1), reach)
 
     def cast(
         self,
@@ -78,7 +88,6 @@ class Rays:
         position: ArrayLike,
         attitude: ArrayLike,
         *,
-        reach: float = 20.0,
         which: ArrayLike = 0,
     ) -> Array:
         """Distances to the first solid, m, float32, shape (W, R, C); `reach` if it is further.
@@ -89,10 +98,8 @@ class Rays:
             layouts: Of which each sensor is in one, `Layouts.of(scene, …)`.
             position: Of each sensor, world frame, m, shape (W, 3).
             attitude: Quaternions from its frame to the world's, scalar first, shape (W, 4).
-            reach: m.
             which: Number of its layout, shape (W,).
         """
-        check("reach", Limits(1e-3, MAX_REACH, "m"), reach)
         place = np.atleast_2d(numbers("position", position))
         turn = np.atleast_2d(numbers("attitude", attitude))
         if place.shape[1:] != (3,) or turn.shape != (len(place), 4):
@@ -109,7 +116,7 @@ class Rays:
             expected = f"whole numbers from 0 to {len(kinds) - 1}, one or {len(place)} of them"
             raise InputError(f"which: expected {expected}, got {shortened(which)}")
         scenes = np.full(len(place), scenes)
-        lanes, planes, whole = self._packets
+        lanes, planes, whole, ends = self._packets
         rows, columns = self.directions.shape[:2]
         out = np.empty((len(place), rows * columns), np.float32)
         near = np.array(place, np.float32, order="C")
@@ -117,7 +124,7 @@ class Rays:
         run = code.packets if code else kernels.by_numpy
         run(
             kinds, tables, scenes, near, _matrices(turn), lanes, planes, whole,
-            self._slots, np.float32(reach), out,
+            self._slots, ends, out,
         )  # fmt: skip
         return out.reshape(-1, rows, columns)
 
@@ -141,17 +148,29 @@ class Rays:
         return slots
 
     @cached_property
-    def _packets(self) -> tuple[Array, Array, Array]:
-        """Directions, planes about packets and planes about all rays, as `kernels` has them."""
+    def _packets(self) -> tuple[Array, Array, Array, Array]:
+        """Directions, planes about packets, planes about all rays, and how far these go, as
+        `kernels` has them.
+        """
         rays = self.directions.reshape(-1, 3)
         tiles = rays[self._tiles]
         lanes = tiles.transpose(0, 2, 1).reshape(-1, 3 * LANES)
         planes = np.array([_around(tile) for tile in tiles])  # (K, 5, 3)
         planes = np.pad(planes, ((0, -len(planes) % LANES), (0, 0), (0, 0)))
         blocks = planes.reshape(-1, LANES, 15).transpose(0, 2, 1).reshape(-1, 15 * LANES)
-        whole = _around(rays)
-        kept = whole if whole.any() else whole[:0]
-        return lanes.astype(np.float32), blocks.astype(np.float32), kept.astype(np.float32)
+        reach = self.reach.ravel()
+        around = _around(rays)
+        whole = np.zeros((6, 4))
+        whole[:5, :3] = around
+        whole[5] = (*-around[-1], (rays @ around[-1] * reach).max())
+        kept = whole if around.any() else whole[:0]
+        single = np.float32
+        return (
+            lanes.astype(single),
+            blocks.astype(single),
+            kept.astype(single),
+            (reach[self._tiles].astype(single)),
+        )
 
 
 def _around(rays: np.ndarray) -> np.ndarray:

@@ -20,7 +20,7 @@ from . import kernels
 from .build import HIDDEN_GROUP, add_scene, is_ground
 from .config import SceneConfig, parse_scene
 from .fields import centered, check_points
-from .generators import Parts, about_z, parts_of
+from .generators import Draft, Parts, drafted, parts_of
 from .looks import HALL_XML
 from .motion import REST, offsets
 from .obstacles import OWN, Obstacle, obstacles_of, parts_of_obstacles
@@ -30,7 +30,7 @@ Array = NDArray[np.float64]
 
 MAX_CELLS = 1 << 26
 """Most cells of a grid, which takes 0.5 GB then."""
-_CYLINDER, _HFIELD = map(kernels.KINDS.index, ("cylinder", "hfield"))
+_SPHERE, _CAPSULE, _CYLINDER, _BOX, _PLANE, _HFIELD = range(len(kernels.KINDS))
 _SIZE = Limits(1e-4, 1e4, "m")
 _ENDLESS = 1e6  # m: half the width of a plane
 _SHEET = 5e-4  # m: half the thickness of a plane of a size, which lies below its face
@@ -73,37 +73,47 @@ class Solids:
     @classmethod
     def of_layout(cls, scene: SceneConfig, seed: int) -> "Solids":
         """What stands in one layout of a scene, without level ground at z = 0."""
+        if scene.is_seeded:
+            return cls.of_drafts([drafted(scene, seed)])[0]
         return _made(scene, seed).standing()
 
     @classmethod
-    def of_parts(cls, parts: Sequence[Parts], scene: str) -> Self:
+    def of_drafts(cls, drafts: Sequence[Draft]) -> "list[Solids]":
+        """The same of several layouts of a scene, quicker than one by one."""
+        name = drafts[0].scene.name
+        whole = cls.of_parts(Parts.of(drafts), name)
+        owner = np.repeat(np.arange(len(drafts)), [draft.count for draft in drafts])
+        ends = np.bincount(owner[whole.stands], minlength=len(drafts)).cumsum().tolist()
+        kept = whole.standing()
+        layouts = map(kept.part, [0, *ends], ends)
+        if name == "warehouse":
+            return [_hall().standing() + layout for layout in layouts]
+        return list(layouts)
+
+    @classmethod
+    def of_parts(cls, parts: Parts, scene: str) -> Self:
         """What stands in a scene from a seed."""
-        if not parts:
-            return cls.of_obstacles(())
-        _, kinds, sizes, centers, _, turns, motions, grids, turned = zip(*parts, strict=True)
-        axes = about_z(np.concatenate(turns)) if turned[0] is None else np.concatenate(turned)
-        kind = np.concatenate(kinds)
-        half = _halves(kind, np.concatenate(sizes))
-        center = np.concatenate(centers)
-        is_sized = (half >= 0.0) & (half <= _ENDLESS)
-        if not (is_sized & (abs(center) <= _ENDLESS)).all():
+        half = _halves(parts.kinds, parts.sizes)
+        furthest = abs(parts.positions).max(initial=0.0)
+        least, largest = half.min(initial=0.0), half.max(initial=0.0)
+        if not (furthest <= _ENDLESS and least >= 0.0 and largest <= _ENDLESS):
             raise InputError(
                 f"scene: expected sizes and places within 1e6 m, got others in {scene}"
             )
         return cls(
-            label=lambda: tuple(f"{scene}/{name}" for one in parts for name in one.names()),
-            kinds=kind,
-            centers=center,
-            axes=axes,
+            label=lambda: tuple(f"{scene}/{name}" for name in parts.names()),
+            kinds=parts.kinds,
+            centers=parts.positions,
+            axes=parts.axes,
             halves=half,
-            motions=np.concatenate(motions),
-            grids=np.concatenate(grids),
+            motions=parts.motions,
+            grids=parts.grids,
         )
 
     @classmethod
     def of_obstacles(cls, obstacles: Sequence[Obstacle]) -> Self:
         """Those of a file."""
-        return cls.of_parts([parts_of_obstacles(obstacles)], OWN)
+        return cls.of_parts(parts_of_obstacles(obstacles), OWN)
 
     @classmethod
     def of_model(cls, model: MjModel, which: ArrayLike | None = None) -> Self:
@@ -167,10 +177,8 @@ class Solids:
 
     def __add__(self, other: "Solids") -> "Solids":
         """These and others."""
-        return Solids(lambda: self.names + other.names, *[
-            np.concatenate([getattr(self, one.name), getattr(other, one.name)])
-            for one in fields(self)[1:]
-        ])  # fmt: skip
+        pairs = [(getattr(self, name), getattr(other, name)) for name in _ARRAYS]
+        return Solids(lambda: self.names + other.names, *map(np.concatenate, pairs))
 
     @property
     def moves(self) -> NDArray[np.bool_]:
@@ -182,16 +190,22 @@ class Solids:
         away = offsets(self.motions, np.array([time]))
         return replace(self, centers=self.centers + away)
 
+    @property
+    def stands(self) -> NDArray[np.bool_]:
+        """Which of them reach above level ground at z = 0, (N,)."""
+        reach = (abs(self.axes[:, 2]) * self.halves).sum(axis=1)
+        return np.asarray(self.centers[:, 2] + reach > 1e-6)
+
     def standing(self) -> "Solids":
-        """What reaches above level ground at z = 0."""
-        kept = self.centers[:, 2] + (abs(self.axes[:, 2]) * self.halves).sum(axis=1) > 1e-6
-        first = int(kept.argmax()) if len(kept) else 0
-        rest = slice(first, None)
-        chosen = rest if kept[rest].all() else kept  # quicker
-        return Solids(
-            lambda: tuple(compress(self.names, kept)),
-            *[getattr(self, one.name)[chosen] for one in fields(self)[1:]],
-        )
+        """What stands."""
+        kept = self.stands
+        arrays = [getattr(self, name)[kept] for name in _ARRAYS]
+        return Solids(lambda: tuple(compress(self.names, kept)), *arrays)
+
+    def part(self, first: int, last: int) -> "Solids":
+        """From a solid to before another one."""
+        arrays = [getattr(self, name)[first:last] for name in _ARRAYS]
+        return Solids(lambda: self.names[first:last], *arrays)
 
     @cached_property
     def names(self) -> tuple[str, ...]:
@@ -201,21 +215,24 @@ class Solids:
     @cached_property
     def table(self) -> Array:
         """As `kernels` has it, shape (16, N)."""
-        is_round = self.kinds < _CYLINDER
-        rounding = np.where(is_round, self.halves[:, 0], 0.0)
-        columns = self.axes.transpose(0, 2, 1).reshape(-1, 9)
-        table = np.column_stack((self.centers, columns, self.halves, rounding)).T
+        table = np.empty((kernels.ROWS, len(self)))
+        table[:3] = self.centers.T
+        table[3:12] = self.axes.transpose(2, 1, 0).reshape(9, -1)
+        table[12:15] = self.halves.T
+        table[15] = np.where(self.kinds < _CYLINDER, table[12], 0.0)
         tables = [table]
-        for number in np.flatnonzero(self.kinds == _HFIELD).tolist():
+        grids = np.flatnonzero(self.kinds == _HFIELD).tolist()
+        for number in grids:
             table[-1, number] = sum(one.shape[1] for one in tables) - number
             tables.append(_columns_of(self.grids[number], self.halves[number]))
-        return np.concatenate(tables, axis=1)
+        return np.concatenate(tables, axis=1) if grids else table  # no copy: quicker
 
     @cached_property
     def columns(self) -> NDArray[np.int8]:
         """Kinds of the columns of `table`."""
-        more = self.table.shape[1] - len(self)
-        return np.concatenate((self.kinds, np.full(more, kernels.REST, np.int8)))
+        kinds = np.full(self.table.shape[1], kernels.REST, np.int8)
+        kinds[: len(self)] = self.kinds
+        return kinds
 
     def distance(self, points: ArrayLike) -> Array:
         """From points, (..., 3), m, to the nearest solid, m, (...); below 0 within one.
@@ -293,6 +310,9 @@ def numbers(name: str, given: ArrayLike) -> Array:
     if not np.isfinite(array).all():
         raise InputError(f"{name}: expected finite numbers, got {shortened(given)}")
     return array
+
+
+_ARRAYS = [one.name for one in fields(Solids)[1:]]
 
 
 class Layouts(NamedTuple):
@@ -404,10 +424,14 @@ def _field_of(model: MjModel, geom: int) -> tuple[float, Array]:
 def _halves(kinds: NDArray[np.int8], sizes: Array) -> Array:
     """Half the sides of boxes about primitives of sizes as MuJoCo has them, m, (n, 3)."""
     a, b, c = sizes.T
-    x = np.choose(kinds, (a, a, a, a, _ENDLESS, a))  # in the order of `kernels.KINDS`
-    y = np.choose(kinds, (a, a, a, b, _ENDLESS, b))
-    z = np.choose(kinds, (a, a + b, b, c, 0.0, c))
-    return np.column_stack((x, y, z))
+    is_round = kinds <= _CYLINDER
+    length = np.where(kinds == _SPHERE, 0.0, b) + np.where(kinds == _CYLINDER, 0.0, a)
+    half = np.empty((len(kinds), 3))
+    half[:, 0] = a
+    half[:, 1] = np.where(is_round, a, b)
+    half[:, 2] = np.where(is_round, length, c)
+    half[kinds == _PLANE] = (_ENDLESS, _ENDLESS, 0.0)
+    return half
 
 
 @lru_cache(maxsize=256)

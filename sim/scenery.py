@@ -10,7 +10,7 @@ from ..models.errors import InputError
 from ..models.vehicle import Vehicle, can_touch, craft_geoms
 from ..scenes import SceneConfig, kernels
 from ..scenes.config import NEW_SEEDS
-from ..scenes.generators import openings_of
+from ..scenes.generators import drafted, openings_of
 from ..scenes.motion import REST, offsets
 from ..scenes.solids import Layouts, Solids
 from .compile import Untraceable
@@ -60,7 +60,8 @@ class Scenery(Kept):
         self.layouts = Layouts.of(*laid)
         self._largest = max((len(one) - len(self._always) for one in laid), default=0)
         self.openings: Array = np.zeros((worlds, *openings_of(scene, 0).shape))
-        self._openings = np.array([self._opened(seed) for seed in self._given.tolist()])
+        opened = [openings_of(scene, seed) for seed in self._given.tolist()]
+        self._openings = np.array([self._checked(one) for one in opened])
         if self.moves:  # each world has a time of its own
             most = self.most
             self._motions = np.zeros((worlds, most, len(REST)))
@@ -86,8 +87,11 @@ class Scenery(Kept):
 
     def solids(self, seed: int) -> Solids:
         """What stands in a layout, without ground and `own`."""
-        solids = Solids.of_layout(self.scene, seed)
-        if solids.moves.any() and not self.moves:
+        return self._still(Solids.of_layout(self.scene, seed))
+
+    def _still(self, solids: Solids) -> Solids:
+        """The same. Raises `InputError` if it moves, in a scene that says that nothing does."""
+        if not self.moves and solids.motions.any():
             raise InputError(f"scene: expected {self.scene.name} to be registered with moves=True")
         return solids
 
@@ -221,12 +225,13 @@ class Scenery(Kept):
 
     def _lay(self, worlds: NDArray[np.int64]) -> None:
         """Lay out what these worlds have: each has a row of its own."""
+        if not worlds.size:
+            return
         count = len(self.seeds)
-        made = {}
-        for world in worlds.tolist():
-            seed = int(self.seeds[world])
-            made[world] = self.solids(seed)
-            self.openings[world] = self._opened(seed)
+        drafts = [drafted(self.scene, seed) for seed in self.seeds[worlds].tolist()]
+        self.openings[worlds] = [self._checked(draft.ways) for draft in drafts]
+        layouts = map(self._still, Solids.of_drafts(drafts))
+        made = dict(zip(worlds.tolist(), layouts, strict=True))
         kinds, tables = self.layouts
         largest = max((len(one.columns) for one in made.values()), default=0)
         most = max(kinds.shape[1], len(self._always.columns) + largest)
@@ -243,9 +248,8 @@ class Scenery(Kept):
                 self._motions[world, len(solids) :] = REST
                 self._places[world] = self.centers[world].T
 
-    def _opened(self, seed: int) -> Array:
+    def _checked(self, found: Array) -> Array:
         """Openings of a layout. Raises `InputError` unless there are as many as in all others."""
-        found = openings_of(self.scene, seed)
         if found.shape != self.openings.shape[1:]:
             expected = f"{self.openings.shape[1]} openings in each layout of {self.scene.name}"
             raise InputError(f"scene: expected {expected}, got {len(found)}")

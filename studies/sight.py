@@ -17,7 +17,10 @@ from numpy.random import Generator
 from rotorgram.scenes import Layouts, Rays, Solids
 
 REACH = 20.0
-SENSORS = {"camera": Rays.pinhole(24, 32, 90.0), "lidar": Rays.rings(16, 48, -15.0, 15.0)}
+SENSORS = {
+    "camera": Rays.pinhole(24, 32, 90.0, REACH),
+    "lidar": Rays.rings(16, 48, -15.0, 15.0, REACH),
+}
 SIDES = {20: 24.0, 60: 40.0, 200: 72.0}
 """Width of a scene by its number of solids, m."""
 WORLDS = 256
@@ -84,7 +87,7 @@ def errors(scenes: int) -> dict[str, float]:
         sensor = list(SENSORS.values())[number % 2]
         model = random_model(dice, 60)
         place, turn = random_poses(dice, 1, SIDES[60])
-        ours = sensor.cast(Layouts.of(Solids.of_model(model)), place, turn, reach=REACH).ravel()
+        ours = sensor.cast(Layouts.of(Solids.of_model(model)), place, turn).ravel()
         ahead = sensor.directions.reshape(-1, 3)
         gaps = abs(ours - by_mujoco(model, place[0], turn[0], ahead))
         rays += gaps.size
@@ -116,7 +119,7 @@ def speed(count: int, name: str, rounds: int) -> dict[str, object]:
     found = np.zeros(len(geoms))
 
     def ours() -> None:
-        sensor.cast(layouts, place, turn, reach=REACH, which=which)
+        sensor.cast(layouts, place, turn, which=which)
 
     def theirs() -> None:
         for model, data, start in zip(models, datas, place.astype(float), strict=False):

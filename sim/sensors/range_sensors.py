@@ -48,6 +48,7 @@ _RULES: Mapping[str, Rule] = {
     "rate": SAMPLING["rate"].limits,
     "delay": SAMPLING["delay"].limits,
 }
+_BEYOND = 1.001  # of its reach: rays end where nothing returns
 _DEFAULTS = {
     "noise": 0.0, "share": 0.0, "growth": 0.0, "dropout": 0.0, "edge_dropout": 0.0,
     "position": (0.0, 0.0, 0.0), "pitch": 0.0, "yaw": 0.0, "rate": None, "delay": 0.0,
@@ -109,7 +110,6 @@ class RangeSensor(Instrument):
         self._use = crc32(f"sensor {kind}".encode())
         sensor = _rays_of(kind, values)
         turn = _turn(math.radians(values["yaw"]), math.radians(values["pitch"]))
-        self.rays = Rays(sensor.directions @ turn.T)
         along = sensor.directions[..., 0].ravel()
         self._is_flat = kind != "lidar" and "directions" not in model
         self._scale = (along if self._is_flat else np.ones_like(along)).astype(np.float32)
@@ -121,6 +121,8 @@ class RangeSensor(Instrument):
                 f"got {self.errors.reach:g}"
             )
         self.shape = sensor.directions.shape[:2]
+        ends = np.minimum(_BEYOND * self.errors.reach / self._scale, MAX_REACH)
+        self.rays = Rays(sensor.directions @ turn.T, ends.reshape(self.shape))
         grid = ("ring", "azimuth") if kind == "lidar" else ("row", "column")
         self.axes = () if "directions" in model else grid
         what = "along the axis of the sensor" if self._is_flat else "along each ray"
@@ -158,13 +160,12 @@ class RangeSensor(Instrument):
         if self._mount.any():
             place = place + to_world(turn, self._mount + 0.0 * place)
         which = np.broadcast_to(scenery.which[:, None], due.shape)[chosen].ravel()
-        reach = min(self.errors.reach / float(self._scale.min()), MAX_REACH)
         place = clip(place, -MAX_PLACE, MAX_PLACE)
-        ranges = self.rays.cast(scenery.layouts, place, turn, reach=reach, which=which)
+        ranges = self.rays.cast(scenery.layouts, place, turn, which=which)
         if drones > 1:
             balls = Layouts.of_balls(_others(moment.position)[chosen], self._radius)
             rows = np.arange(len(place))
-            hits = self.rays.cast(balls, place, turn, reach=reach, which=rows)
+            hits = self.rays.cast(balls, place, turn, which=rows)
             ranges = np.minimum(ranges, hits)
         flat = ranges.reshape(len(place), -1)
         words = self._words(moment, due, chosen, flat.shape)

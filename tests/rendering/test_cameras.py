@@ -295,7 +295,7 @@ def test_depth_is_that_of_rays_among_solids(made: Any, scene: str) -> None:
     ahead = pixels @ np.linalg.inv(lens.matrix).T @ lens.rotation  # 1 m of depth each
     eye = -lens.rotation.T @ lens.translation
     scenery = Layouts.of(Solids.of_scene(f"{scene}:3"))
-    found = Rays(ahead).cast(scenery, eye, (1.0, 0.0, 0.0, 0.0), reach=100.0)[0]
+    found = Rays(ahead, reach=100.0).cast(scenery, eye, (1.0, 0.0, 0.0, 0.0))[0]
     found = found / np.linalg.norm(ahead, axis=-1)
     near = found < 30.0
     errors = abs(found / depth - 1.0)[near]

@@ -135,7 +135,7 @@ def test_rays_and_pictures_see_them_where_they_are(opengl: None) -> None:
     origin = -lens.rotation.T @ lens.translation
     for now, picture in seen.items():
         layouts = Layouts.of(Solids.of_scene(scene).at(now))
-        along = Rays(rays / size[..., None]).cast(layouts, origin[None], turn, reach=90.0)[0]
+        along = Rays(rays / size[..., None], reach=90.0).cast(layouts, origin[None], turn)[0]
         flat = along / size
         near = (picture < 30.0) & (flat < 30.0)
         assert near.sum() > 100

@@ -11,12 +11,15 @@ import numpy as np
 import pytest
 from rotorgram.models import InputError
 from rotorgram.scenes import Layouts, Rays, Solids, kernels
+from rotorgram.scenes.obstacles import Obstacle
 from sight import OFF, REACH, SENSORS, SIDES, by_mujoco, random_model, random_poses
 
 LEVEL = (1.0, 0.0, 0.0, 0.0)
+AHEAD = Rays.pinhole(6, 32, 120.0).directions
 PATTERNS = {
     **SENSORS,
     "depth of 6 x 32": Rays.pinhole(6, 32, 120.0),
+    "up to a plane": Rays(AHEAD, 9.0 / AHEAD[..., 0]),
     "one ring": Rays.rings(1, 360, 0.0, 0.0),
     "8 x 8": Rays.pinhole(8, 8, 45.0),
     "five": Rays([[(1, 0, 0), (-1, 0, 0), (0, 1, 0), (0, -1, 0), (0, 0, 1)]]),
@@ -47,14 +50,14 @@ def test_numba_has_the_bits_of_numpy(name: str, by_numpy: Any) -> None:
     place, turn = random_poses(dice, 12, SIDES[60])
     which = np.arange(12) % 4
     rays = PATTERNS[name]
-    fast = rays.cast(layouts, place, turn, which=which, reach=REACH)
-    slow = by_numpy(rays, layouts, place, turn, which=which, reach=REACH)
+    fast = rays.cast(layouts, place, turn, which=which)
+    slow = by_numpy(rays, layouts, place, turn, which=which)
     assert fast.dtype == np.float32
     assert fast.shape == (12, *rays.directions.shape[:2])
     assert fast.tobytes() == slow.tobytes()
     assert (fast < REACH).any()
     for world in (0, 5):
-        alone = rays.cast(Layouts.of(scenes[which[world]]), place[world], turn[world], reach=REACH)
+        alone = rays.cast(Layouts.of(scenes[which[world]]), place[world], turn[world])
         assert alone.tobytes() == fast[world].tobytes()
 
 
@@ -65,7 +68,7 @@ def test_rays_are_mujocos(name: str) -> None:
     for _ in range(4):
         model = random_model(dice, 60)
         place, turn = random_poses(dice, 1, SIDES[60])
-        ours = rays.cast(Layouts.of(Solids.of_model(model)), place, turn, reach=REACH).ravel()
+        ours = rays.cast(Layouts.of(Solids.of_model(model)), place, turn).ravel()
         theirs = by_mujoco(model, place[0], turn[0], rays.directions.reshape(-1, 3))
         assert (abs(ours - theirs) < OFF).all()
         assert (ours < REACH).mean() > 0.1
@@ -75,7 +78,7 @@ def test_a_ray_from_within_meets_what_it_leaves() -> None:
     model = random_model(np.random.default_rng(0), 20)
     scene = Solids.of_model(model)
     rays = Rays([[(1.0, 0.0, 0.0), (0.0, 0.0, -1.0)]])
-    ours = rays.cast(Layouts.of(scene), scene.centers[1:], [LEVEL] * 19, reach=REACH)
+    ours = rays.cast(Layouts.of(scene), scene.centers[1:], [LEVEL] * 19)
     for number in range(19):
         start = scene.centers[number + 1].astype(np.float32)
         theirs = by_mujoco(model, start, np.array(LEVEL), rays.directions[0])
@@ -96,12 +99,21 @@ def test_directions() -> None:
 
 def test_the_ground_below_a_sensor() -> None:
     layouts = Layouts.of(Solids.of_scene("plain"))
-    rays = Rays([[(0.0, 0.0, -1.0), (1.0, 0.0, -1.0), (1.0, 0.0, 0.0)]])
-    found = rays.cast(layouts, (3.0, -2.0, 2.0), LEVEL, reach=5.0)
+    rays = Rays([[(0.0, 0.0, -1.0), (1.0, 0.0, -1.0), (1.0, 0.0, 0.0)]], reach=5.0)
+    found = rays.cast(layouts, (3.0, -2.0, 2.0), LEVEL)
     assert found.ravel() == pytest.approx((2.0, 2.0 * 2**0.5, 5.0))
     nose_down = (0.5**0.5, 0.0, 0.5**0.5, 0.0)
-    found = rays.cast(layouts, [(0.0, 0.0, 2.0)], [nose_down], reach=5.0)
+    found = rays.cast(layouts, [(0.0, 0.0, 2.0)], [nose_down])
     assert found.ravel() == pytest.approx((5.0, 2.0 * 2**0.5, 2.0), abs=1e-6)
+
+
+def test_each_ray_ends_where_it_should() -> None:
+    wall = Solids.of_obstacles([Obstacle(kind="box", size=(1.0, 50.0, 50.0), position=(9.0, 0, 0))])
+    layouts = Layouts.of(wall)  # its face is 8 m ahead
+    for depth in (7.9, 7.995, 8.005, 30.0):
+        rays = Rays(AHEAD, depth / AHEAD[..., 0])
+        found = rays.cast(layouts, (0.0, 0.0, 0.0), LEVEL)[0] * AHEAD[..., 0]
+        assert found == pytest.approx(np.full((6, 32), min(depth, 8.0)), abs=1e-4)
 
 
 CODE = """
@@ -143,7 +155,11 @@ def test_what_is_refused() -> None:
         (lambda: Rays.rings(2, 2, -91.0, 0.0), "low: expected a number from -90 to 90 degrees"),
         (lambda: Rays([(1.0, 0.0, 0.0)]), r"directions: expected shape \(rows, columns, 3\)"),
         (lambda: Rays([[(0.0, 0.0, 0.0)]]), "directions: expected vectors that are not 0"),
-        (lambda: rays.cast(layouts, (0, 0, 1), LEVEL, reach=0), "reach: expected a number from"),
+        (lambda: Rays.pinhole(2, 2, 90.0, reach=0), "reach: expected a number from"),
+        (
+            lambda: Rays([[(1, 0, 0)]], reach=[1, 2]),
+            r"reach: expected one number or shape \(1, 1\)",
+        ),
         (
             lambda: rays.cast(layouts, (0, 0, np.nan), LEVEL),
             "position: expected finite numbers, got",

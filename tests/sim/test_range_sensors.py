@@ -31,13 +31,13 @@ def step(loop: Loop, resets: Any = None, seeds: Any = None) -> None:
     loop.advance(actions, resets, seeds)
 
 
-def cast(loop: Loop, rays: Rays, reach: float, mount: Any = (0.0, 0.0, 0.0)) -> Any:
+def cast(loop: Loop, rays: Rays, mount: Any = (0.0, 0.0, 0.0)) -> Any:
     state = loop.record.state
     layouts = Layouts.of(Solids.ground() + Solids.of_scene(WOOD).standing())
     place = state.position[:, 0] + np.array(
         [turned(q, mount) for q in state.quaternion[:, 0].astype(float)]
     )
-    return rays.cast(layouts, place, state.quaternion[:, 0], reach=reach)
+    return rays.cast(layouts, place, state.quaternion[:, 0])
 
 
 def turned(q: Any, vector: Any) -> Any:
@@ -53,13 +53,13 @@ def turned(q: Any, vector: Any) -> Any:
 def test_depth_is_measured_along_the_axis_and_lidar_along_the_rays() -> None:
     lidar = {"model": "os0", "rows": 4, "columns": 16, "noise": 0.0, "near": 0.01}
     loop = loop_with({"depth": {"rows": 6, "columns": 8, **EXACT}, "lidar": lidar})
-    camera = Rays.pinhole(6, 8, 87.0)
-    along = cast(loop, camera, 30.0) * camera.directions[..., 0]
+    camera = Rays.pinhole(6, 8, 87.0, reach=30.0)
+    along = cast(loop, camera) * camera.directions[..., 0]
     seen = loop.observations["depth"]
     assert seen.dtype == np.float32
     assert seen == pytest.approx(np.minimum(along, 10.0), abs=1e-4)
     assert (seen < 10.0).any()
-    rings = cast(loop, Rays.rings(4, 16, -45.0, 45.0), 35.0)
+    rings = cast(loop, Rays.rings(4, 16, -45.0, 45.0, reach=35.0))
     assert loop.observations["lidar"] == pytest.approx(rings, abs=1e-4)
     assert loop.spec.observation[1].frame == "body, along the axis of the sensor"
 
@@ -69,8 +69,8 @@ def test_a_mount_moves_and_turns_a_sensor() -> None:
     loop = loop_with({"tof": {"model": "multiranger", "noise": 0.0, "share": 0.0, **mount}})
     # Pitched down, its front is the body's down, and its top is the body's front.
     down, up, left, right, front = loop.observations["tof"][:, 0].T
-    rays = Rays([[(0, 0, -1), (0, 0, 1), (0, 1, 0), (0, -1, 0), (1, 0, 0)]])
-    expected = cast(loop, rays, 4.0, (0.3, -0.2, 0.1))[:, 0]
+    rays = Rays([[(0, 0, -1), (0, 0, 1), (0, 1, 0), (0, -1, 0), (1, 0, 0)]], reach=4.0)
+    expected = cast(loop, rays, (0.3, -0.2, 0.1))[:, 0]
     got = np.column_stack((down, up, left, right, front))
     assert got == pytest.approx(expected, abs=1e-4)
 
