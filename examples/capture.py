@@ -22,6 +22,7 @@ from operator import attrgetter, itemgetter
 from pathlib import Path
 from typing import Annotated, NamedTuple
 
+import mujoco
 import numpy as np
 import tyro
 from numpy.random import Generator
@@ -304,7 +305,7 @@ def frame_of(job: Job, row: int, cameras: Cameras) -> tuple[dict[str, bytes], La
             ending, data = encoded(view, image)
             file = f"{view.kind}/{view.camera.name}/{number:06}{suffix}.{ending}"
             files[file] = data
-            lens = cameras.lens(view.name, state, drone)
+            lens = lens_of(cameras, view, drone)
             height, width = view.shape[:2]
             picture: Labels = {
                 "file": file,
@@ -415,6 +416,49 @@ def write_coco(
         "categories": [{"id": number, "name": name} for name, number in categories.items()],
     }
     write_whole(file, json.dumps(content, separators=(",", ":")) + "\n")
+
+
+class Lens(NamedTuple):
+    """How points of the world come to pixels: p = K (R x + t), then over its third number."""
+
+    matrix: Floats
+    """K, shape (3, 3), pixels."""
+    rotation: Floats
+    """R, shape (3, 3), from the world's frame to the camera's."""
+    translation: Floats
+    """t, shape (3,), m."""
+
+
+def lens_of(cameras: Cameras, view: View, drone: int = 0) -> Lens:
+    """The lens of a view's camera, of a drone of the world that was drawn last.
+
+    A camera's frame here: x right, y down, z along its axis, as in computer vision.
+    """
+    model = cameras.model
+    name = view.camera.name
+    camera = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_CAMERA, name)
+    if camera < 0:  # a drone carries it
+        camera = model.camera(f"{drone_names(drone + 1)[drone]}/{name}").id
+    axes = cameras.data.cam_xmat[camera].reshape(3, 3)
+    rotation = (axes * (1.0, -1.0, -1.0)).T
+    translation = -rotation @ cameras.data.cam_xpos[camera]
+    height, width, _ = view.shape
+    return Lens(matrix_of(model, camera, width, height), rotation, translation)
+
+
+def matrix_of(model: mujoco.MjModel, camera: int, width: int, height: int) -> Floats:
+    """K of a camera of a model, shape (3, 3), pixels."""
+    if model.cam_sensorsize[camera].any():
+        focal = model.cam_intrinsic[camera]
+        scale = np.array((width, height)) / model.cam_sensorsize[camera]
+        fx, fy = focal[:2] * scale
+        cx = width / 2 - focal[2] * scale[0]
+        cy = height / 2 - focal[3] * scale[1]
+    else:
+        fx = fy = 0.5 * height / np.tan(np.radians(model.cam_fovy[camera]) / 2)
+        cx = width / 2
+        cy = height / 2
+    return np.array(((fx, 0.0, cx), (0.0, fy, cy), (0.0, 0.0, 1.0)))
 
 
 def category(name: str) -> str:

@@ -1,1 +1,1 @@
-"""Flights: evaluation, logs, films, data sets, labelled pictures, identification."""
+"""Flights: evaluation, logs, films."""

@@ -4,12 +4,10 @@ A picture shows exactly the state that `take` gets: no time passes. Pictures hav
 own; the physics does not see it.
 
 Pixels: row 0 is the top, column 0 the left; the middle of the first pixel is at (0.5, 0.5).
-A camera's frame here: x right, y down, z along its axis, as in computer vision.
 """
 
 from collections.abc import Mapping, Sequence
 from functools import cached_property
-from typing import NamedTuple
 
 import mujoco
 import numpy as np
@@ -39,18 +37,6 @@ _THINNEST = 0.04  # Thickness of a disc, over the height at which the lowest cra
 _PLAIN = (0.5, 0.5, 0.5, 1.0)  # MuJoCo's colour of a geom that has that of its material
 _UNNAMED = "unnamed"
 _HIDDEN = 5  # a group of geoms that is not drawn
-_FLIP = np.array((1.0, -1.0, -1.0))  # from MuJoCo's camera frame to that of vision
-
-
-class Lens(NamedTuple):
-    """How points of the world come to pixels: p = K (R x + t), then over its third number."""
-
-    matrix: Array
-    """K, shape (3, 3), pixels."""
-    rotation: Array
-    """R, shape (3, 3), from the world's frame to the camera's."""
-    translation: Array
-    """t, shape (3,), m."""
 
 
 class Cameras:
@@ -63,6 +49,8 @@ class Cameras:
     Attributes:
         views: As given.
         objects: Names of objects; a segmentation picture has their indices.
+        model: What is drawn.
+        data: Of the world that was drawn last.
         pictures: The last picture of each drone by the view's name, shape (N, H, W, channels).
     """
 
@@ -144,15 +132,6 @@ class Cameras:
                 mine = {name: mask[world] for name, mask in of_world.items()}
                 self._draw_world(rows.start, mine)
 
-    def lens(self, name: str, state: Arrays, drone: int = 0) -> Lens:
-        """The lens of a view's camera, of a drone of the first world, in a state as of `take`."""
-        self._pose(state, 0)
-        camera = self._cameras[name][drone]
-        rotation = (self.data.cam_xmat[camera].reshape(3, 3) * _FLIP).T
-        translation = -rotation @ self.data.cam_xpos[camera]
-        height, width = self.pictures[name].shape[1:3]
-        return Lens(_matrix(self.model, camera, width, height), rotation, translation)
-
     def _pose(self, state: Arrays, world: int) -> slice:
         """Put the model where a state has a world; the rows of the world's drones."""
         drones = self._shape[1]
@@ -231,21 +210,6 @@ class Cameras:
         """Free the context. A second call does nothing."""
         if "_drawing" in vars(self):
             self._drawing.close()
-
-
-def _matrix(model: MjModel, camera: int, width: int, height: int) -> Array:
-    """K of a camera of a model, shape (3, 3), pixels."""
-    if model.cam_sensorsize[camera].any():
-        focal = model.cam_intrinsic[camera]
-        scale = np.array((width, height)) / model.cam_sensorsize[camera]
-        fx, fy = focal[:2] * scale
-        cx = width / 2 - focal[2] * scale[0]
-        cy = height / 2 - focal[3] * scale[1]
-    else:
-        fx = fy = 0.5 * height / np.tan(np.radians(model.cam_fovy[camera]) / 2)
-        cx = width / 2
-        cy = height / 2
-    return np.array(((fx, 0.0, cx), (0.0, fy, cy), (0.0, 0.0, 1.0)))
 
 
 # ---- the model that is drawn

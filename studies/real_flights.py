@@ -23,22 +23,17 @@ from typing import Final
 
 import numpy as np
 from measuring import RESULTS, options
-from rotorgram.flights.flight_logs import FlightLog, read_log
-from rotorgram.flights.identify import Fit, Origin, vehicle_toml
-from rotorgram.flights.prediction import (
-    Floats,
-    Numbers,
-    Windows,
-    differences,
-    mean_speeds,
-    numbers_of,
-    predict,
-)
 from rotorgram.models.vehicle import Vehicle
 from rotorgram.sim.effects import EffectOptions
 from rotorgram.sim.rotations import to_body
 from rotorgram.sim.state import InitialState
 from rotorgram.sim.world import make_world
+
+sys.path.append(str(Path(__file__).parents[1] / "examples" / "identification"))
+from fit import Fit
+from flight_logs import FlightLog, Floats, read_log
+from prediction import Numbers, Windows, differences, mean_speeds, numbers_of, predict
+from vehicle_text import Origin, vehicle_toml
 
 START: Final = Path(__file__).with_name("nanodrone.toml")
 HORIZONS: Final = (1, 10, 50)

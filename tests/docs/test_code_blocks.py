@@ -134,6 +134,8 @@ def test_python_runs_as_pasted(
         run([sys.executable, "-c", FLIGHT], tmp_path)
     for words in re.findall(r"^# rotorgram (.+)$", code, re.MULTILINE):
         run(rotorgram(*words.split()), tmp_path)
+    for script, words in re.findall(r"^# python (examples/\S+) (.+)$", code, re.MULTILINE):
+        run([sys.executable, str(ROOT / script), *words.split()], tmp_path)
     if "policy.onnx" in code:
         run(rotorgram("export", training, "--to", "onnx"), tmp_path)
     if "8001" in code:
@@ -271,9 +273,10 @@ def test_commands_and_flags_in_the_text_are_ones_that_there_are(
 ) -> None:
     monkeypatch.syspath_prepend(EXAMPLES)
     own = flags_of("sim", "--env", "landing:Landing-v0")
-    capture = [sys.executable, EXAMPLES / "capture.py", "--help"]
-    shown = subprocess.run(capture, capture_output=True, text=True, check=True).stdout
-    flags = own.union(FLAG.findall(shown), *(flags_of(command) for command in COMMANDS))
+    flags = own.union(*(flags_of(command) for command in COMMANDS))
+    for script in ("capture.py", "dataset.py", "identification/identify.py"):
+        shown = run([sys.executable, str(EXAMPLES / script), "--help"], ROOT)
+        flags |= set(FLAG.findall(shown))
     for page in PAGES:
         name = page.relative_to(ROOT).as_posix()
         for mention in re.findall(r"`([^`\n]+)`", FENCE.sub("", page.read_text(encoding="utf-8"))):

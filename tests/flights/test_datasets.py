@@ -2,6 +2,8 @@
 
 import json
 import resource
+import subprocess
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -9,25 +11,19 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
+import pyarrow.parquet as pq
 import pytest
 from cases import each
+from dataset import RecordedEpisodes, env_of, write_minari, write_parquet
 from peers import ANY, Running
+from programs import EXAMPLES
 from relay import FaultConfig, relaying
-from rotorgram.cli import main
 from rotorgram.envs.config import EnvConfig
 from rotorgram.envs.registry import env_spec
 from rotorgram.envs.spec import EnvSpec
-from rotorgram.flights.datasets import (
-    RecordedEpisodes,
-    env_of,
-    write_minari,
-    write_parquet,
-)
 from rotorgram.models.errors import InputError
 from rotorgram.udp import LinkConfig, RemoteEnv, RemoteVectorEnv, Simulator
 
-pa = pytest.importorskip("pyarrow")
-pq = pytest.importorskip("pyarrow.parquet")
 LOSSY = FaultConfig(drop=0.1, duplicate=0.1, reorder=0.1, seed=3)
 ELEVATION = "rotorgram/Elevation-v0"
 HOVER = "rotorgram/Hover-v0"
@@ -143,7 +139,6 @@ def test_what_is_read_flies_again_to_the_same_bits(
 
 @pytest.fixture
 def minari(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Any:
-    pytest.importorskip("h5py")
     monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "sets"))
     return pytest.importorskip("minari")
 
@@ -224,13 +219,20 @@ def test_a_frozen_drone_makes_no_steps(tmp_path: Path) -> None:
     assert second.actions.ravel().tolist() == [0.0, 0.375, 0.5, 0.625]
 
 
+def run(*words: object) -> subprocess.CompletedProcess[str]:
+    """The example program."""
+    command = [sys.executable, EXAMPLES / "dataset.py", *map(str, words)]
+    return subprocess.run(command, capture_output=True, text=True, timeout=110)
+
+
 def test_several_journals_are_one_data_set(tmp_path: Path) -> None:
     paths = [tmp_path / "a.mcap", tmp_path / "b.mcap"]
     for seed, path in enumerate(paths):
         with recording(path, episode_length=4) as remote:
             fly_one(remote, [seed])
     out = tmp_path / "both.parquet"
-    assert main(["dataset", *map(str, paths), "--to", "parquet", "--out", str(out)]) == 0
+    done = run(*paths, "--to", "parquet", "--out", out)
+    assert done.stdout == f"{out}: 2 episodes, 8 steps\n", done.stderr
     read = pq.read_table(out)
     assert read["journal"].to_pylist() == ["a.mcap"] * 5 + ["b.mcap"] * 5
     assert read["episode"].to_pylist() == [0] * 5 + [1] * 5
@@ -255,41 +257,35 @@ def journals(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def refused(capsys: pytest.CaptureFixture[str], *words: object) -> str:
-    """The one line that a command answers."""
-    assert main(["dataset", *map(str, words)]) == 1
-    sentence = capsys.readouterr().err
-    assert sentence.count("\n") == 1
-    return sentence
+def refused(*words: object) -> str:
+    """The one line that the program answers."""
+    done = run(*words)
+    assert done.returncode == 1
+    assert done.stderr.count("\n") == 1
+    return done.stderr
 
 
 @each("names, sentence", "dataset")
 def test_wrong_journals_are_one_sentence(
-    journals: Path,
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
-    names: list[str],
-    sentence: str,
+    journals: Path, tmp_path: Path, names: list[str], sentence: str
 ) -> None:
     out = tmp_path / "new.parquet"
     paths = [journals / name for name in names]
-    assert sentence in refused(capsys, *paths, "--to", "parquet", "--out", out)
+    assert sentence in refused(*paths, "--to", "parquet", "--out", out)
     assert not out.exists()
 
 
-def test_a_wrong_place_is_one_sentence(
-    journals: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_wrong_place_is_one_sentence(journals: Path, tmp_path: Path) -> None:
     there = tmp_path / "there.parquet"
     there.write_bytes(b"mine")
     words = (journals / "good.mcap", "--to", "parquet", "--out")
     expected = f"expected the name of a new file, got {there}, which exists"
-    assert expected in refused(capsys, *words, there)
+    assert expected in refused(*words, there)
     assert there.read_bytes() == b"mine"
-    assert "a folder that exists" in refused(capsys, *words, tmp_path / "no" / "new.parquet")
+    assert "a folder that exists" in refused(*words, tmp_path / "no" / "new.parquet")
     wrong = ("--to", "minari", "--out", "some/flight-v0", "--vehicle", "nobodys.toml")
     expected = "vehicle: cannot read nobodys.toml: No such file"
-    assert expected in refused(capsys, journals / "good.mcap", *wrong)
+    assert expected in refused(journals / "good.mcap", *wrong)
 
 
 def test_a_write_that_fails_names_the_file_and_leaves_none(journals: Path, tmp_path: Path) -> None:

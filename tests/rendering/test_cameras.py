@@ -10,6 +10,7 @@ from typing import Any
 import mujoco
 import numpy as np
 import pytest
+from capture import Lens, lens_of
 from pictures import TABLES
 from rotorgram.envs.spec import Mark
 from rotorgram.models import InputError
@@ -19,7 +20,7 @@ from rotorgram.models.export import export_mjcf
 from rotorgram.models.fleet import load_vehicles
 from rotorgram.models.library import vehicle_names
 from rotorgram.models.vehicle import Vehicle
-from rotorgram.rendering.cameras import Cameras, Lens, drawn_model, objects_in
+from rotorgram.rendering.cameras import Cameras, drawn_model, objects_in
 from rotorgram.rendering.gl import offscreen_context
 from rotorgram.scenes import Layouts, Rays, Solids, seeded_scenes
 from rotorgram.sim.rotations import to_world
@@ -209,7 +210,7 @@ def test_depth_is_that_of_rays(made: Any) -> None:
     cameras = made("chase_depth@160x120", shape=(1, 2))
     told = state((0.0, 0.0, 3.0), (-1.5, 0.4, 3.4), quaternion=TILTED)
     depth = take(cameras, **told)["chase_depth"][0, ..., 0]
-    lens = cameras.lens("chase_depth", told)
+    lens = lens_of(cameras, cameras.views[0])
     dice = np.random.default_rng(3)
     rows = dice.integers(120, size=1000)
     columns = dice.integers(160, size=1000)
@@ -274,7 +275,7 @@ def test_known_points_come_to_their_pixels(made: Any, tmp_path: Path, lens: str)
     red, green, blue = np.moveaxis(picture, 2, 0)
     pink = (red > 2 * green) & (blue > 2 * green)
     places = np.argwhere(pink)[:, ::-1] + 0.5
-    lens = cameras.lens("portrait", told)
+    lens = lens_of(cameras, cameras.views[0])
     for tip in tips:
         point = told["position"][0] + to_world(TILTED, tip)
         pixel = pixels_of(lens, point)
@@ -289,7 +290,7 @@ def test_depth_is_that_of_rays_among_solids(made: Any, scene: str) -> None:
     cameras = made("front_depth@96x72", "crazyflie2", scene=f"{scene}:3")
     told = state((3.0, -2.0, 4.0), quaternion=TILTED)
     depth = take(cameras, **told)["front_depth"][0, ..., 0]
-    lens = cameras.lens("front_depth", told)
+    lens = lens_of(cameras, cameras.views[0])
     rows, columns = np.mgrid[:72, :96] + 0.5
     pixels = np.stack((columns, rows, np.ones_like(rows)), axis=-1)
     ahead = pixels @ np.linalg.inv(lens.matrix).T @ lens.rotation  # 1 m of depth each
@@ -308,7 +309,7 @@ def test_points_of_a_depth_picture_lie_on_the_ground(made: Any) -> None:
     cameras = made("down_depth@32x24", "crazyflie2")
     told = state((0.3, 0.2, 2.0), quaternion=TILTED)
     depth = take(cameras, **told)["down_depth"][0, ..., 0]
-    lens = cameras.lens("down_depth", told)
+    lens = lens_of(cameras, cameras.views[0])
     rows, columns = np.indices(depth.shape) + 0.5
     rays = np.stack((columns, rows, np.ones(depth.shape)), axis=-1)
     seen = rays @ np.linalg.inv(lens.matrix).T * depth[..., None]
@@ -326,7 +327,7 @@ def test_segmentation_knows_the_pad_by_its_area(made: Any) -> None:
     told = state((0.0, 0.0, 2.0), goal=np.array([[0.1, 0.2, 0.0]]))
     picture = take(cameras, **told)["down_segmentation"][0, ..., 0]
     assert set(np.unique(picture)) <= {1, 2, 3}
-    lens = cameras.lens("down_segmentation", told)
+    lens = lens_of(cameras, cameras.views[0])
     thick = 0.04 * craft.rest_height
     height = 2.0 - 0.75 * craft.rest_height - thick  # of the camera over the disc's upper side
     expected = math.pi * (0.5 * lens.matrix[0, 0] / height) ** 2

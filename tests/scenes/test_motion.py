@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from capture import lens_of
 from rotorgram.envs import Loop
 from rotorgram.envs.config import EnvConfig
 from rotorgram.models.cameras import chosen_views
@@ -124,7 +125,7 @@ def test_rays_and_pictures_see_them_where_they_are(opengl: None) -> None:
             state = {"position": place, "quaternion": turn, "time": np.array([now])}
             cameras.take({views[0].name: np.ones(1, bool)}, state)
             seen[now] = cameras.pictures[views[0].name][0, ..., 0].copy()
-        lens = cameras.lens(views[0].name, state)
+        lens = lens_of(cameras, views[0])
     assert (abs(seen[0.0] - seen[time]) > 0.5).any()
     fx, fy = lens.matrix[0, 0], lens.matrix[1, 1]
     rows, columns = np.mgrid[:24, :32] + 0.5

@@ -7,8 +7,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from rotorgram.flights.flight_logs import FlightLog
-from rotorgram.flights.prediction import Windows, numbers_of, predict
 from rotorgram.models.vehicle import Vehicle
 from rotorgram.models.vehicle_file import read_vehicle_file
 
@@ -16,6 +14,8 @@ pytest.importorskip("scipy")
 pytest.importorskip("pandas")
 
 import real_flights
+from flight_logs import FlightLog
+from prediction import Windows, numbers_of, predict
 
 ROOT = Path(__file__).parents[2]
 RESULTS = ROOT / "docs" / "results" / "real_flights"

@@ -7,11 +7,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from dataset import RecordedEpisodes
 from peers import ANY, simulate
 from relay import FaultConfig, relaying
 from rotorgram.envs import LocalVectorEnv
 from rotorgram.envs.parallel import LocalParallelEnv
-from rotorgram.flights.datasets import RecordedEpisodes
 from rotorgram.models import InputError
 from rotorgram.udp import LinkConfig, RemoteVectorEnv, Simulator
 from rotorgram.udp.journal.reader import Summary

@@ -5,12 +5,11 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
+import pandas
 import pytest
-from rotorgram.flights.flight_logs import MOTION, FlightLog, read_log, with_lag
+from flight_logs import MOTION, FlightLog, read_log, with_lag
 from rotorgram.models.errors import InputError
 from rotorgram.models.vehicle import Vehicle
-
-pandas = pytest.importorskip("pandas")
 
 LIVELY = Vehicle.load(Path(__file__).parents[1] / "data" / "lively.toml")
 SPEEDS = [f"m{i}_rads" for i in range(1, 5)]

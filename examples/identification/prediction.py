@@ -14,18 +14,17 @@ from dataclasses import replace
 from typing import Self
 
 import numpy as np
-
-from ..models.coefficients import Coefficients
-from ..models.fields import immutable
-from ..models.vehicle import Vehicle
-from ..scenes import SceneConfig, Solids
-from ..sim.backends.rigid import RigidWorld
-from ..sim.effects import EffectOptions
-from ..sim.rotations import between
-from ..sim.scenery import Scenery
-from ..sim.state import InitialState
-from ..sim.world import PhysicsError
-from .flight_logs import FlightLog, Floats, Ints
+from flight_logs import FlightLog, Floats, Ints
+from rotorgram.models.coefficients import Coefficients
+from rotorgram.models.fields import immutable
+from rotorgram.models.vehicle import Vehicle
+from rotorgram.scenes import SceneConfig, Solids
+from rotorgram.sim.backends.rigid import RigidWorld
+from rotorgram.sim.effects import EffectOptions
+from rotorgram.sim.rotations import between
+from rotorgram.sim.scenery import Scenery
+from rotorgram.sim.state import InitialState
+from rotorgram.sim.world import PhysicsError
 
 Numbers = Mapping[str, float]
 """Numbers of a vehicle by the names of `NAMES`, in the units of `models/coefficients.toml`."""

@@ -1,33 +1,43 @@
-"""Data sets for offline reinforcement learning: the whole episodes of journals, for Minari or as
-Parquet. See `docs/datasets.md`."""
+"""Journals as a data set for offline reinforcement learning: `docs/datasets.md` has the layout.
+
+    rotorgram evaluate pid --episodes 2 --record flight.mcap
+    python examples/dataset.py flight.mcap --to parquet --out flight.parquet [--help]
+
+It writes whole episodes for Minari, or as one Parquet file.
+"""
 
 import copy
 import re
+import sys
 import warnings
 from collections.abc import Iterable, Iterator, Sequence, Sized
 from dataclasses import fields, replace
 from itertools import chain
 from pathlib import Path
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING, Literal, TypeVar
 
 import gymnasium as gym
 import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import tyro
 from gymnasium.envs.registration import EnvSpec as GymSpec
 from numpy.typing import NDArray
-
-from ..envs import registry
-from ..envs.config import EnvConfig
-from ..envs.spaces import action_space, joined, observation_space
-from ..envs.spec import ArraySpec, EnvSpec
-from ..models.errors import InputError, require
-from ..models.files import check_new_file, removed_on_error
-from ..udp.journal.reader import Session
-from .recorded import read_episodes
-from .signals import telemetry_of
-from .trajectories import Trajectory
+from rotorgram.envs import registry
+from rotorgram.envs.config import EnvConfig
+from rotorgram.envs.spaces import action_space, joined, observation_space
+from rotorgram.envs.spec import ArraySpec, EnvSpec
+from rotorgram.flights.recorded import read_episodes
+from rotorgram.flights.signals import telemetry_of
+from rotorgram.flights.trajectories import Trajectory
+from rotorgram.models import MAX_DRONES, InputError
+from rotorgram.models.fields import immutable
+from rotorgram.models.files import check_new_file, removed_on_error
+from rotorgram.models.fleet import load_vehicles
+from rotorgram.udp.journal.reader import Session, count_of
+from tyro.conf import Positional
 
 if TYPE_CHECKING:
-    import pyarrow as pa
     from minari.data_collector.episode_buffer import EpisodeBuffer
 
 _Item = TypeVar("_Item", bound=Sized)
@@ -116,10 +126,6 @@ def write_parquet(episodes: RecordedEpisodes, out: Path) -> None:
 
     Raises `InputError`: `out` exists, or its folder does not; or while the episodes are read.
     """
-    require("pyarrow", "dataset", "a data set as Parquet")
-    import pyarrow as pa
-    import pyarrow.parquet as pq
-
     check_new_file(out, ".parquet")
     tables = (_table(episodes.spec, i, episodes.journal, one) for i, one in enumerate(episodes))
     batches = map(pa.concat_tables, _batches(tables))
@@ -142,9 +148,7 @@ def _batches(items: Iterable[_Item]) -> Iterator[list[_Item]]:
         yield batch
 
 
-def _table(spec: EnvSpec, number: int, journal: str, episode: Trajectory) -> "pa.Table":
-    import pyarrow as pa
-
+def _table(spec: EnvSpec, number: int, journal: str, episode: Trajectory) -> pa.Table:
     rows = len(episode) + 1
 
     def repeated(value: object, kind: pa.DataType) -> pa.Array:
@@ -187,10 +191,8 @@ def _ends(episode: Trajectory, ending: str) -> NDArray[np.bool_]:
     return ends
 
 
-def _columns(stem: str, array: ArraySpec, values: NDArray[np.generic]) -> "dict[str, pa.Array]":
+def _columns(stem: str, array: ArraySpec, values: NDArray[np.generic]) -> dict[str, pa.Array]:
     """One column for each component of a vector; an array of more axes is one column of lists."""
-    import pyarrow as pa
-
     flat = values.reshape(len(values), -1)
     if len(array.shape) > 1:
         return {stem: pa.FixedSizeListArray.from_arrays(pa.array(flat.ravel()), array.size)}
@@ -212,8 +214,6 @@ def write_minari(
 
     Raises `InputError`: the id is wrong, or exists; or while the episodes are read.
     """
-    require("minari", "dataset", "a data set for Minari")
-    require("h5py", "dataset", "a data set for Minari")
     from minari import create_dataset_from_buffers
     from minari.storage.datasets_root_dir import get_dataset_path
 
@@ -261,6 +261,7 @@ def env_of(spec: EnvSpec, vehicle: Path | str | None = None) -> GymSpec | None:
 
 
 def _buffer(spec: EnvSpec, episode: Trajectory) -> "EpisodeBuffer":
+    """An episode for Minari."""
     from minari.data_collector.episode_buffer import EpisodeBuffer
 
     infos = {}
@@ -276,3 +277,62 @@ def _buffer(spec: EnvSpec, episode: Trajectory) -> "EpisodeBuffer":
         truncations=_ends(episode, "truncated"),
         infos=infos,
     )
+
+
+# ---- the program
+
+
+@immutable
+class Command:
+    """Write the whole episodes of journals as a data set, for Minari or as Parquet.
+
+    An episode that was given up, or whose end is not in the journal, is left out and counted.
+    """
+
+    journals: Positional[tuple[Path, ...]]
+    """MCAP files that --record wrote, all of one env."""
+    to: Literal["minari", "parquet"]
+    """minari: a data set that minari.load_dataset finds. parquet: one file, one row per step."""
+    out: str
+    """minari: its id, as rotorgram/elevation-v0; MINARI_DATASETS_PATH is the folder of them all.
+    parquet: the file to write."""
+    env: str | None = None
+    """module:Name-v0 to import a module of the working directory that registers the journals' task.
+    An id in a journal is never imported."""
+    vehicle: str | None = None
+    """TOML or MJCF file that was flown, or its name. Default: the paper's quadcopter."""
+
+    def run(self) -> None:
+        """Write it; print what it holds."""
+        if not self.journals:
+            raise InputError("journals: expected one or more, got none")
+        if self.vehicle:
+            # Before a journal is read: a wrong name is no other env.
+            load_vehicles(self.vehicle, MAX_DRONES)
+        if self.env:
+            registry.load(self.env)
+        episodes = RecordedEpisodes(self.journals)
+        if self.to == "minari":
+            write_minari(episodes, self.out, self.vehicle)
+        else:
+            write_parquet(episodes, Path(self.out))
+        print(
+            f"{self.out}: {count_of(episodes.count, 'episode')}, {count_of(episodes.steps, 'step')}"
+        )
+        if episodes.left_out:
+            print(f"left out: {count_of(episodes.left_out, 'episode')}, not recorded to the end")
+        if self.to == "minari" and env_of(episodes.spec, self.vehicle) is None:
+            print(
+                f"recover_environment cannot make its env: {episodes.spec.env_id} with this "
+                "vehicle and these options is not known here; --env MODULE:NAME registers a task, "
+                "--vehicle names the vehicle"
+            )
+
+
+if __name__ == "__main__":
+    try:
+        tyro.cli(Command).run()
+    except (InputError, ImportError, OSError) as error:
+        sys.exit(str(error))
+    except KeyboardInterrupt:
+        sys.exit(130)

@@ -6,12 +6,14 @@ from pathlib import Path
 from typing import NoReturn
 
 import numpy as np
+import pandas
 from numpy.typing import NDArray
-
-from ..models.errors import InputError, one_line, require
-from ..models.fields import immutable
-from ..models.files import read_own_toml
-from ..models.vehicle import Vehicle
+from rotorgram.models import InputError
+from rotorgram.models.errors import one_line
+from rotorgram.models.fields import immutable
+from rotorgram.models.files import read_own_toml
+from rotorgram.models.vehicle import Vehicle
+from scipy.signal import lfilter
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int_]
@@ -104,8 +106,6 @@ def with_lag(log: FlightLog, time_constant: float) -> FlightLog:
 
     They begin at the first command; a command holds until the next sample.
     """
-    from scipy.signal import lfilter
-
     decay = float(np.exp(-log.period / time_constant))
     first = log.speeds[:1]
     held = np.concatenate((first, log.speeds[:-1]))
@@ -144,9 +144,6 @@ def _table(path: Path) -> Columns:
         return _ulog(path)
     if kind not in (".csv", ".parquet"):
         raise InputError(f"log: expected a .csv, .parquet or .ulg file, got {path.name}")
-    pandas = require("pandas", "identify", "reading a log")
-    if kind == ".parquet":
-        require("pyarrow", "identify", "reading a Parquet file")
     try:
         frame = pandas.read_csv(path) if kind == ".csv" else pandas.read_parquet(path)
     except ValueError as error:  # of pandas and pyarrow
@@ -243,7 +240,8 @@ _TOPICS = ("vehicle_local_position", _ATTITUDE, _RATES)
 
 def _ulog(path: Path) -> Columns:
     """Columns of a PX4 log in our frames: world north, west, up; body forward, left, up."""
-    pyulog = require("pyulog", "identify", "reading a ULog file")
+    import pyulog  # for these files alone
+
     try:
         log = pyulog.ULog(str(path))
     except (TypeError, ValueError, LookupError) as error:

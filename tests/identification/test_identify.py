@@ -1,24 +1,30 @@
 """System identification: known values come back, and what a log does not tell is named."""
 
+import subprocess
+import sys
+import tomllib
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import pandas
 import pytest
-from cases import CASES
-from rotorgram.cli import main
-from rotorgram.flights.flight_logs import MOTION, FlightLog, read_log
-from rotorgram.flights.identify import identify
-from rotorgram.flights.prediction import Windows, differences, numbers_of, predict
+from estimates import identify
+from flight_logs import MOTION, FlightLog, read_log
+from prediction import Windows, differences, numbers_of, predict
+from programs import EXAMPLES
 from rotorgram.models.errors import InputError
 from rotorgram.models.vehicle import Vehicle
 from rotorgram.sim.effects import EffectOptions
 from rotorgram.sim.world import make_world
 from worlds import alone, begin
 
-pytest.importorskip("scipy")
-pandas = pytest.importorskip("pandas")
-
-LIVELY = Path(__file__).parents[1] / "data" / "lively.toml"
+DATA = Path(__file__).parents[1] / "data"
+CASES = tomllib.loads((DATA / "identification.toml").read_text("utf-8"))
+LIVELY = DATA / "lively.toml"
+SCRIPT = EXAMPLES / "identification" / "identify.py"
+PROGRAM = [sys.executable, SCRIPT]
 SPEEDS = [f"m{i}_rads" for i in range(1, 5)]
 TRUE = CASES["lively"]
 WRONG = CASES["wrong"].values()
@@ -138,15 +144,21 @@ def test_a_yawing_craft_does_not_tell_reaction_and_inertia_apart(tmp_path: Path)
     assert reaction.value == pytest.approx(0.02)
 
 
-def test_the_command_writes_a_vehicle_that_loads(
-    commands: Path, wrong: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+def run(*words: object, program: Sequence[Any] = PROGRAM) -> subprocess.CompletedProcess[str]:
+    """A program, the example's by default."""
+    command = [*program, *map(str, words)]
+    return subprocess.run(command, capture_output=True, text=True, timeout=110)
+
+
+def test_the_program_writes_a_vehicle_that_loads(
+    commands: Path, wrong: Path, tmp_path: Path
 ) -> None:
     out = tmp_path / "new.toml"
-    words = ["identify", str(commands), "--vehicle", str(wrong), "--out", str(out)]
-    assert main([*words, "--period", "0.005"]) == 0
-    told = capsys.readouterr().out
-    assert "95 % interval" in told
-    assert "clustered over 15 segments of 2 s" in told
+    words = (commands, "--vehicle", wrong, "--out", out)
+    done = run(*words, "--period", "0.005")
+    assert done.returncode == 0, done.stderr
+    assert "95 % interval" in done.stdout
+    assert "clustered over 15 segments of 2 s" in done.stdout
     vehicle = Vehicle.load(out)
     own = vehicle.coefficients
     assert vehicle.mass == 0.5
@@ -156,8 +168,9 @@ def test_the_command_writes_a_vehicle_that_loads(
     text = out.read_text()
     assert 'source = "identified from lively"' in text
     assert "95 % interval" in text
-    # A file is not overwritten.
-    assert main(words) == 1
+    again = run(*words)
+    assert again.returncode == 1
+    assert again.stderr.startswith("out: expected the name of a new file, got ")
 
 
 def test_a_prediction_is_the_simulator_s(tmp_path: Path) -> None:
@@ -218,9 +231,47 @@ def test_a_short_log_and_an_unknown_number_are_refused(tmp_path: Path) -> None:
         identify(vehicle, [log], ["mass"])
 
 
-def test_a_folder_that_is_not_there_is_told_before_anything_is_flown(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+@pytest.mark.parametrize(
+    ("words", "sentence"),
+    [
+        (["log.csv", "--out", "none/new.toml"], "out: expected a folder that exists for it, got "),
+        (["--out", "new.toml"], "logs: expected one or more, got none"),
+        (["no.csv", "--out", "new.toml"], "[Errno 2] No such file or directory: 'no.csv'"),
+        (["log.csv", "--out", "new.toml"], "log.csv: expected columns m1...4_rads or "),
+    ],
+)
+def test_wrong_words_are_one_sentence(
+    words: list[str], sentence: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    out = tmp_path / "none" / "new.toml"
-    assert main(["identify", "log.csv", "--vehicle", "paper", "--out", str(out)]) == 1
-    assert "out: expected a folder that exists for it, got " in capsys.readouterr().err
+    monkeypatch.chdir(tmp_path)
+    Path("log.csv").write_text("t,x\n0,0\n")
+    done = run(*words, "--vehicle", "paper")
+    assert done.returncode == 1
+    assert done.stderr.startswith(sentence)
+    assert done.stderr.count("\n") == 1
+    assert not Path("new.toml").exists()
+
+
+INTERRUPTED = """
+import runpy, signal, sys
+sys.path.insert(0, sys.argv[1])
+import estimates
+estimates.identify = lambda *_: signal.raise_signal(signal.SIGINT)
+sys.argv = sys.argv[2:]
+runpy.run_path(sys.argv[0], run_name="__main__")
+"""
+
+
+def test_ctrl_c_leaves_no_file(commands: Path, wrong: Path, tmp_path: Path) -> None:
+    out = tmp_path / "new.toml"
+    words = (SCRIPT.parent, SCRIPT, commands, "--vehicle", wrong, "--out", out)
+    done = run(*words, program=[sys.executable, "-c", INTERRUPTED])
+    assert done.returncode == 130
+    assert done.stderr == ""
+    assert not out.exists()
+
+
+def test_a_wrong_period_is_a_wrong_flag(tmp_path: Path) -> None:
+    done = run("log.csv", "--vehicle", "paper", "--out", tmp_path / "new.toml", "--period", "1")
+    assert done.returncode == 2
+    assert "period: expected a number from 0.0001 to 0.1 s" in done.stderr
