@@ -30,7 +30,7 @@ from .layers import ByName, Parts, named, part_of
 from .policies import NetworkPolicy
 from .presets import preset
 
-FORMAT = 5
+FORMAT = 6
 _PLAIN = ("algorithm", "config", "backend", "seed", "env_steps", "versions")
 
 _DTYPES: dict[Any, type[np.generic]] = {int: np.int64, float: np.float64, bool: np.bool_}

@@ -23,6 +23,7 @@ Parts = dict[str, Floats]
 ByName = dict[str, np.ndarray]
 Shapes = Mapping[str, tuple[int, ...]]
 Item = TypeVar("Item")
+BRIGHTEST = np.float32(255.0)  # of a byte of a picture
 _ZERO, _QUARTER, _HALF, _ONE, _TWO = map(np.float32, (0.0, 0.25, 0.5, 1.0, 2.0))
 
 
@@ -231,30 +232,36 @@ class Chain(Layer):
         return slope
 
 
-class Nearness(Layer):
-    """2 / (1 + d / 2 m) - 1 / 2 of distances d >= 0 m, in their place: what is near differs most.
+class Scaling(Layer):
+    """Distances as nearness and bytes of pictures as 0 to 1, in their place; the others stay.
 
-    `places` has the slices of the inputs that are distances; the others stay.
+    A distance d >= 0 m is 2 / (1 + d / 2 m) - 1 / 2: what is near differs most. `distances` and
+    `pictures` are slices of the inputs.
     """
 
-    def __init__(self, places: Sequence[slice]) -> None:
-        self.places = places
+    def __init__(self, distances: Sequence[slice], pictures: Sequence[slice]) -> None:
+        self.distances = distances
+        self.pictures = pictures
 
     def forward(self, inputs: Floats) -> Floats:
-        self._inputs = inputs
-        for place in self.places:
-            values = inputs[..., 1:, :][..., place, :]
+        self._seen = seen = inputs[..., 1:, :]
+        for place in self.distances:
+            values = seen[..., place, :]
             np.maximum(values, _ZERO, out=values)
             values *= _HALF
             values += _ONE
             np.divide(_TWO, values, out=values)
             values -= _HALF
+        for place in self.pictures:
+            seen[..., place, :] /= BRIGHTEST
         return inputs
 
     def back(self, slope: Floats) -> Floats:
-        for place in self.places:
-            values = self._inputs[..., 1:, :][..., place, :] + _HALF
+        for place in self.distances:
+            values = self._seen[..., place, :] + _HALF
             slope[..., place, :] *= -_QUARTER * values * values
+        for place in self.pictures:
+            slope[..., place, :] /= BRIGHTEST
         return slope
 
 

@@ -13,7 +13,7 @@ from ..envs.spec import ArraySpec
 from ..models.errors import InputError
 from .config import Config
 from .convolutions import Encoder, is_grid, slices
-from .layers import Affine, Chain, Floats, Layer, Nearness, Relu, Tanh, sized
+from .layers import BRIGHTEST, Affine, Chain, Floats, Layer, Relu, Scaling, Tanh, sized
 from .memory import GRU, Sequences
 
 _ACTIVATIONS: dict[str, type[Layer]] = {"relu": Relu, "tanh": Tanh}
@@ -22,7 +22,7 @@ _ACTIVATIONS: dict[str, type[Layer]] = {"relu": Relu, "tanh": Tanh}
 class Network(Chain):
     """Layers in a row, from inputs (..., n, B) to outputs (..., k, B). Subclasses build the last.
 
-    Distances come in as nearness; then come the encoder and the memory, if it has them.
+    Distances and pictures are scaled; then come the encoder and the memory, if it has them.
 
     Attributes:
         inputs: Numbers that it sees, n.
@@ -36,8 +36,9 @@ class Network(Chain):
         """The inputs are these arrays, one after the other."""
         self.inputs = inputs = sum(array.size for array in arrays)
         layers: list[Layer] = []
-        if distances := distances_in(arrays):
-            layers.append(Nearness(distances))
+        scaled = scaled_in(arrays)
+        if any(scaled):
+            layers.append(Scaling(*scaled))
         if self.convolves:
             if not any(map(is_grid, arrays)):
                 names = ", ".join(array.name for array in arrays)
@@ -111,10 +112,15 @@ def make_network(arrays: Sequence[ArraySpec], outputs: int, config: Config) -> N
     return NETWORKS[config.network](arrays, outputs, config)
 
 
-def distances_in(arrays: Sequence[ArraySpec]) -> list[slice]:
-    """Where arrays, one after the other, have distances along rays: two axes, m, from 0 on."""
-    found = []
+def scaled_in(arrays: Sequence[ArraySpec]) -> tuple[list[slice], list[slice]]:
+    """Where arrays, one after the other, have what networks see scaled: distances along rays (two
+    axes or more, m, from 0 on), and bytes of pictures.
+    """
+    distances = []
+    pictures = []
     for array, place in zip(arrays, slices([array.size for array in arrays]), strict=True):
-        if array.unit == "m" and len(array.shape) == 2 and array.low == 0.0:
-            found.append(place)
-    return found
+        if array.unit == "m" and len(array.shape) > 1 and array.low == 0.0:
+            distances.append(place)
+        elif array.dtype == "uint8" and array.high == BRIGHTEST:
+            pictures.append(place)
+    return distances, pictures

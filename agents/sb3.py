@@ -13,7 +13,7 @@ from .config import Config, SACConfig
 from .episodes import EpisodeRecorder
 from .layers import ByName, Floats
 from .learner import OnUpdate, seeds_of
-from .networks import distances_in
+from .networks import scaled_in
 from .policies import NetworkPolicy, flat_size
 from .ppo import PPO, PPOConfig
 from .rollouts import Diverged
@@ -159,10 +159,10 @@ class SB3Agent:
             raise InputError(f"network: expected mlp without memory with SB3, got {got}")
         if log.spec != log.spec.for_actor():
             raise InputError("sb3: expected no privileged arrays, which SB3's actor would see too")
-        if distances_in(log.spec.observation):
+        if any(scaled_in(log.spec.observation)):
             raise InputError(
-                "sb3: expected observations without distances of rays, which our own agents "
-                "take as nearness and SB3's do not"
+                "sb3: expected observations without distances of rays and pictures, which our own "
+                "agents scale and SB3's do not"
             )
         self.spec = log.spec
         self._config = config

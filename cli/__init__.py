@@ -50,8 +50,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(128 + signal.SIGTERM))
     if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
         signal.signal(signal.SIGINT, _interrupt)
-    # Processes that this one starts import nothing from the working directory either.
-    os.environ.setdefault("PYTHONSAFEPATH", "1")
     # A second thread of NumPy's products loses on small networks, and takes the simulator's core.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     # Imports make many objects and no garbage: to look for it takes a tenth of a short command.

@@ -81,6 +81,14 @@ class OneOrMore:
 Files = Annotated[tuple[Path, ...], OneOrMore()]
 
 
+class ModuleFlag(Command):
+    """A command on files, which may be of a task or a scene of the user's own."""
+
+    env: str | None = None
+    """module:Name-v0 to import a module of the working directory that registers the task, or its
+    scene. An id in a file is never imported."""
+
+
 class EnvFlags(Command):
     """A command that takes any task."""
 

@@ -18,6 +18,7 @@ from ._flags import (
     BackendFlags,
     Command,
     EnvFlags,
+    ModuleFlag,
     Options,
     Words,
     parse_value,
@@ -42,6 +43,10 @@ def parse(kind: type[Command], prog: str, words: Sequence[str]) -> Command:
         command = _parsed_env(kind, prog, words, given)
     else:
         command = replace(_run_tyro(_for_tyro(kind), prog, words), given=given)
+    if isinstance(command, ModuleFlag) and command.env:
+        from ..envs import registry
+
+        registry.load(command.env)
     check_fields(command)
     return command
 

@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, ClassVar
 from ..agents import is_controller
 from ..envs.config import EnvConfig
 from ..flights.executors import RunsFailed, WorkersConfig
-from ..flights.folders import FolderBusy
 from ..models.errors import InputError, NoOpenGL, require
 from ..training.settings import Row, Study
 from ._flags import Options, Words
@@ -72,7 +71,7 @@ class StudyFlags(TrainingFlags, WorkersConfig):
             with bars() as progress:
                 run_study(study, folder, workers, command, progress)
         except BaseException as error:
-            if any(folder.iterdir()) and not isinstance(error, FolderBusy):
+            if any(folder.iterdir()) and not isinstance(error, InputError):
                 print(self.go_on_with(self.words, folder, "runner", "address"))
             if isinstance(error, RunsFailed):  # the others are reported all the same
                 report(folder, film=False)
@@ -89,11 +88,6 @@ class StudyFlags(TrainingFlags, WorkersConfig):
                 f"{results.study.kind}"
             )
         self.refuse_settings(folder, _RESUMED)
-        if results.finished:
-            raise InputError(
-                f"resume: expected an interrupted study, {folder} is finished; draw its report "
-                f"with: rotorgram report {folder}"
-            )
         return results.study
 
     # ---- parts of a study
@@ -105,10 +99,6 @@ class StudyFlags(TrainingFlags, WorkersConfig):
             values.setdefault("episodes", 0)  # as many as the seeds need
         return values
 
-    def given_of_rows(self) -> Options:
-        """Settings of rows that were given, but for the env and the changes."""
-        return self._given(_OF_ROWS)
-
     def _given(self, names: Words) -> Options:
         return {name: getattr(self, name) for name in names if name in self.given}
 
@@ -118,7 +108,7 @@ class StudyFlags(TrainingFlags, WorkersConfig):
         if is_controller(agent):
             return Row(agent=agent, name=name, env=env)
         settings: Options = {"env_steps": 200_000, "num_envs": env.drones, "backend": "mujoco"}
-        settings |= self.given_of_rows()
+        settings |= self._given(_OF_ROWS)
         return Row(agent=agent, name=name, env=env, set=changes, **settings)
 
     def changed(self, row: Row) -> Row:
@@ -132,7 +122,7 @@ class StudyFlags(TrainingFlags, WorkersConfig):
         name = "" if row.name == row.default_name else row.name
         if row.controller:
             return replace(row, name=name, env=env)
-        return replace(row, name=name, env=env, set=changes, **self.given_of_rows())
+        return replace(row, name=name, env=env, set=changes, **self._given(_OF_ROWS))
 
 
 def report(folder: Path, film: bool) -> None:

@@ -14,10 +14,6 @@ from ..training.settings import Kind, Row, Study, short_name
 from ._flags import DEFAULT_ENV
 from ._study import StudyFlags
 
-_OF_FILES = ("seeds", "first_seed", "snapshots", "curve_episodes", "episodes", "evaluation",
-                    "wire", "keep_steps")  # fmt: skip
-"""Settings of a study that all files share."""
-
 
 class Compare(StudyFlags):
     """Train several agents over the same seeds, and report: VPG, A2C and SB3's A2C, or your files.
@@ -48,7 +44,8 @@ class Compare(StudyFlags):
         settings = self.given_of_study()
         if "udp" in self.given:
             settings["wire"] = self.udp
-        for name in _OF_FILES:
+        shared = vars(studies[0]).keys() - {"rows", "kind"}
+        for name in sorted(shared):
             values = {getattr(study, name): None for study in studies}
             if len(values) > 1 and name not in settings:
                 raise InputError(

@@ -6,10 +6,10 @@ from typing import Annotated, Literal
 from tyro.conf import Positional, arg
 
 from ..models.files import check_new_file, write_whole
-from ._flags import Command
+from ._flags import ModuleFlag
 
 
-class Export(Command):
+class Export(ModuleFlag):
     """Write a trained policy as one file that flies without rotorgram."""
 
     policy: Positional[Annotated[str, arg(metavar="CHECKPOINT")]]

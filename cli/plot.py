@@ -4,10 +4,10 @@ from pathlib import Path
 
 from tyro.conf import Positional
 
-from ._flags import Command, Count, Files
+from ._flags import Count, Files, ModuleFlag
 
 
-class Plot(Command):
+class Plot(ModuleFlag):
     """Draw what flights have over time: position, attitude, rates, rotors, battery, wind, metrics.
 
     Flights of several journals are laid over each other. A cross is the end of a flight that was

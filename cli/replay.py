@@ -5,10 +5,10 @@ from pathlib import Path
 from tyro.conf import Positional
 
 from ..models import Backend
-from ._flags import Command
+from ._flags import ModuleFlag
 
 
-class Replay(Command):
+class Replay(ModuleFlag):
     """Summarize a journal, and simulate it again."""
 
     file: Positional[Path]
@@ -16,9 +16,6 @@ class Replay(Command):
     verify: bool = False
     """Simulate every session again and compare every bit; exit status 1 if one differs, or the file
     is damaged."""
-    env: str | None = None
-    """module:Name-v0 to import a module of the working directory that registers the journal's
-    task. An id in a journal is never imported."""
     vehicle: str | None = None
     """TOML or MJCF file that was flown, or its name. Default: the paper's quadcopter."""
     backend: Backend | None = None
@@ -33,10 +30,6 @@ class Replay(Command):
         print(Summary(self.file))
         if not self.verify:
             return 0
-        if self.env:
-            from ..envs import registry
-
-            registry.load(self.env)
         verdict = Verification(self.file, vehicle=self.vehicle, backend=self.backend)
         print(verdict)
         return 0 if verdict.identical and not verdict.ending.startswith("damaged") else 1

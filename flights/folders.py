@@ -13,10 +13,6 @@ LOCK = ".lock"
 """File in a folder that its writer holds locked."""
 
 
-class FolderBusy(InputError):
-    """Another process writes to the folder."""
-
-
 def new_folder(out: Path | None, name: str, runs: Path = Path("runs")) -> Path:
     """Make the folder to write to: `out`, or one in `runs`, named by the command and the time; if
     that name is taken, `-2`, `-3`… is added.
@@ -43,7 +39,7 @@ def new_folder(out: Path | None, name: str, runs: Path = Path("runs")) -> Path:
 def locked(folder: Path) -> Iterator[None]:
     """Hold a folder's lock, a file in it that stays; the lock ends with its process.
 
-    Raises `FolderBusy` if another process holds it, `InputError` if it cannot be written.
+    Raises `InputError` if another process holds it, or it cannot be written.
     """
     try:
         file = os.open(folder / LOCK, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
@@ -53,7 +49,7 @@ def locked(folder: Path) -> Iterator[None]:
         raise InputError(f"{folder}: cannot be written: {error.strerror}") from None
     try:
         if not _try_lock(file):
-            raise FolderBusy(f"{folder}: expected a folder that no other process writes to")
+            raise InputError(f"{folder}: expected a folder that no other process writes to")
         yield
     finally:
         os.close(file)

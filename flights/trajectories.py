@@ -31,6 +31,7 @@ if TYPE_CHECKING:
 Floats = NDArray[np.float64]
 
 _EVALUATION = 20230324  # the day the paper appeared
+_OBSERVED = "observation: "
 _SIZE = (40.0, 40.0)  # m: square about the z axis that counts of a scene without a size
 
 EpisodeSet = Literal["final", "curve", "tuning"]
@@ -118,10 +119,21 @@ class Trajectory:
         """What sensors with rays among the observations read after so many steps. Their rays begin
         where the craft was when they were cast.
         """
-        return [
-            sensor.reading(self.observations[sensor.name][step], self.pose[sensor.taken(step)])
-            for sensor in self._range_sensors
-        ]
+        found = []
+        late = int(self.drawn.get("drawn_observation_delay", 0))  # control steps
+        for sensor in self._range_sensors:
+            taken = sensor.taken(step - late)
+            found.append(sensor.reading(self.observations[sensor.name][step], self.pose[taken]))
+        return found
+
+    @cached_property
+    def drawn(self) -> Mapping[str, float]:
+        """What was drawn for the episode, by name."""
+        for array in self.spec.telemetry:
+            if array.name == "drawn":
+                values = self.telemetry["drawn"][0].tolist()
+                return dict(zip(array.components, values, strict=True))
+        return {}
 
     @cached_property
     def scene(self) -> SceneConfig:
@@ -270,7 +282,7 @@ def _fly_batch(
         rows_of = {name: array[: steps + 1, drone] for name, array in arrays.items()}
         trajectory = Trajectory(
             spec=env.env_spec,
-            observations={name: rows_of.pop(name) for name in wanted},
+            observations={name: rows_of.pop(_OBSERVED + name) for name in wanted},
             telemetry=rows_of,
             rewards=all_rewards[:steps, drone],
             actions=all_actions[:steps, drone],
@@ -284,11 +296,11 @@ def _fly_batch(
 
 
 def _row(env: AdvancingVectorEnv, wanted: Sequence[str]) -> Mapping[str, Array]:
-    """The present telemetry, and some arrays of the observations."""
+    """The present telemetry, and some arrays of the observations, which may have its names."""
     seen = env.observations
     if not isinstance(seen, Mapping):
         seen = dict.fromkeys(wanted, seen)
-    return {**env.telemetry, **{name: seen[name] for name in wanted}}
+    return {**env.telemetry, **{_OBSERVED + name: seen[name] for name in wanted}}
 
 
 def _act(
@@ -300,7 +312,13 @@ def _act(
     observations = list(iterate(env.observation_space, env.observations))
     for drone in np.flatnonzero(~done).tolist():
         policy = policies[drone]
-        actions[drone] = space.sample() if policy is None else policy.act(observations[drone])
+        action = space.sample() if policy is None else policy.act(observations[drone])
+        if np.shape(action) != space.shape:
+            raise InputError(
+                f"{type(policy).__name__.lower()}: expected an action of shape {space.shape}, "
+                f"got {np.shape(action)}"
+            )
+        actions[drone] = action
     return actions
 
 

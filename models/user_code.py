@@ -29,7 +29,7 @@ def load_class(option: str, words: str) -> type:
     if not file.endswith(".py"):
         raise InputError(f"{option}: expected FILE.py:CLASS, got {words}")
     if not Path(file).is_file():
-        raise InputError(f"{option}: expected a file of Python, there is none: {file}")
+        raise InputError(f"{option}: expected a file of Python, got none: {Path(file).absolute()}")
     kind = getattr(_module(option, Path(file).resolve()), name, None)
     if not isinstance(kind, type):
         raise InputError(f"{option}: expected a class of {file}, got {name!r}")

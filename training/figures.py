@@ -74,7 +74,7 @@ def draw_figures(results: Results, table: DataFrame) -> list[str]:
             trained = [row for row in rows if not row.controller]
             figures["fig6_reward"] = draw_reward(results, trained)
             figures["fig7_cumulative_reward"] = draw_cumulative(results, trained)
-            if results.has_steps:
+            if (results.folder / "steps").is_dir():
                 figures["fig8_error"] = draw_error(results, rows)
         for name, figure in figures.items():
             for kind in FORMATS:

@@ -10,7 +10,7 @@ from ..flights.filming import Film, FilmTrack, film
 from ..flights.trajectories import flown_trajectories
 from ..models.errors import InputError
 from ..rendering import Camera
-from .results import Results, checkpoint_file
+from .results import Results, checkpoint_file, run_file
 from .tables import row_label
 
 
@@ -33,12 +33,10 @@ def film_study(results: Results, out: Path, tell: Tell = lambda *_: None) -> Non
     camera: Camera = "top" if env.drones > 1 else "front"  # no craft hides another
     vehicle = ",".join(env.vehicle) or None
     config = Film(height=400, camera=camera, fast=True, quality=27, vehicle=vehicle)
-    runs = results.runs
     seed = results.study.first_seed
-    done = set(runs["row"][runs["seed"] == seed])
     tracks = []
     for row in rows:
-        if row.name not in done:
+        if not run_file(results.folder, row, seed).exists():
             continue
         policy: Policy
         name = row_label(row)

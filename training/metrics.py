@@ -171,16 +171,8 @@ def measure_episode(trajectory: Trajectory, headline: Headline) -> Measures:
         "settling_time": settled,
         "overshoot": overshoot(values) if headline.signed else nan,
         "terminated": trajectory.terminated,
-        **_drawn(trajectory),
+        **trajectory.drawn,
     }
-
-
-def _drawn(trajectory: Trajectory) -> Measures:
-    for array in trajectory.spec.telemetry:
-        if array.name == "drawn":
-            values = trajectory.telemetry[array.name][0].tolist()
-            return dict(zip(array.components, values, strict=True))
-    return {}
 
 
 # ---- over the episodes of a run's evaluation

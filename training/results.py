@@ -88,16 +88,35 @@ class ResultsError(InputError):
 
 
 def write_config(folder: Path, command: str, study: Study, specs: Mapping[str, EnvSpec]) -> None:
-    """Write `config.json`: the user's command, the study, the spec of each row's env."""
+    """Write `config.json`: the user's command, the study, and by the names of the rows the specs of
+    their envs and the hashes of their controllers.
+    """
     content = {
         "created": datetime.now(UTC).isoformat(timespec="seconds"),
         "command": command,
         "study": study.to_dict(),
         "specs": {name: json.loads(spec.to_json()) for name, spec in specs.items()},
+        "sources": {row.name: row.source_hash for row in study.rows},
         "versions": software_versions(),
         "machine": machine(),
     }
     write_json(folder / CONFIG_FILE, content)
+
+
+def check_unchanged(folder: Path, study: Study, specs: Mapping[str, EnvSpec]) -> None:
+    """Raise `ResultsError` for a row that is no more what it was when the study began."""
+    begun = Results.read(folder)
+    sources = begun.config.get("sources", {})
+    for row in study.rows:
+        changed = ""
+        if specs[row.name].config_digest != begun.specs[row.name].config_digest:
+            changed = "task, vehicle or scene"
+        elif row.source_hash != sources.get(row.name):
+            changed = row.agent
+        if changed:
+            raise ResultsError(
+                f"resume: {row.name}: expected the {changed} with which {folder} began, got another"
+            )
 
 
 def machine() -> dict[str, object]:
@@ -128,7 +147,7 @@ def write_run(folder: Path, row: Row, seed: int, tables: Tables) -> None:
     """Write what one run gave; the table `runs` last."""
     for name in reversed(tuple(COLUMNS)):
         if name in tables and len(tables[name]):  # columns of an empty table have no type
-            table = tables[name].drop(columns=["row", "seed"], errors="ignore")
+            table = tables[name].copy()
             table.insert(0, "row", row.name)
             table.insert(1, "seed", seed)
             data = table.to_parquet(index=False, compression="zstd")
@@ -173,11 +192,6 @@ class Results:
         """The metric that decides in the row's env."""
         return Headline.of(self.specs[row.name])
 
-    @property
-    def finished(self) -> bool:
-        """Whether all runs are done."""
-        return len(self.runs) == len(self.study.runs())
-
     @cached_property
     def runs(self) -> pd.DataFrame:
         """Of the runs that are done, in the order of the rows and seeds."""
@@ -198,11 +212,6 @@ class Results:
         """Training episodes; one that the end of training cut is not there."""
         return self._table("episodes")
 
-    @property
-    def has_steps(self) -> bool:
-        """Whether the table `steps` was kept."""
-        return bool(self._files("steps"))
-
     def steps(self, phase: str, max_rows: int | None = None) -> pd.DataFrame:
         """Steps of one phase, "train" or "evaluation".
 
@@ -216,11 +225,8 @@ class Results:
         frame: pd.DataFrame = table.to_pandas()
         return frame
 
-    def _files(self, name: str) -> list[Path]:
-        return sorted((self.folder / name).glob("*.parquet"))
-
     def _table(self, name: str) -> pd.DataFrame:
-        files = self._files(name)
+        files = sorted((self.folder / name).glob("*.parquet"))
         if not files:
             return pd.DataFrame(columns=list(COLUMNS[name]))
         try:

@@ -20,7 +20,7 @@ from ..agents import (
     preset,
 )
 from ..agents.presets import PresetName
-from ..envs.config import DEFAULT_ENV, EnvConfig, read_keywords
+from ..envs.config import DEFAULT_ENV, EnvConfig, read_keywords, source_hash
 from ..envs.registry import env_spec, load
 from ..flights.trajectories import EpisodeSet
 from ..models import Backend
@@ -164,6 +164,11 @@ class Row:
     def controller(self) -> bool:
         """Whether the agent is not trained."""
         return is_controller(self.agent)
+
+    @property
+    def source_hash(self) -> str:
+        """Hash of the source of a controller in a file; empty for an agent of ours."""
+        return source_hash(find_controller(self.agent)) if self.controller else ""
 
     @property
     def config(self) -> Config:

@@ -21,7 +21,7 @@ from ..flights.folders import locked
 from ..flights.trajectories import Trajectory, fly_episodes
 from ..udp.spawn import cached_simulator
 from . import results
-from .metrics import Headline, measure_episode, measure_run
+from .metrics import Headline, Measures, measure_episode, measure_run
 from .results import CONFIG_FILE
 from .settings import Row, Study
 from .training import Snapshot, Training
@@ -62,8 +62,8 @@ def run_study(
 
     Raises:
         RunsFailed: Some runs failed; the others are done and kept.
-        InputError: Another process writes to the folder, or there is no such Ray cluster; nothing
-            is written.
+        InputError: Another process writes to the folder, there is no such Ray cluster, or a task,
+            vehicle, scene or controller has changed since the study began; nothing is written.
     """
     jobs = {
         # A worker may not have the files of the vehicle.
@@ -72,8 +72,10 @@ def run_study(
         if not results.run_file(folder, row, seed).exists()
     }
     with open_executor(workers, len(jobs), on_progress) as executor, locked(folder):
-        if not (folder / CONFIG_FILE).exists():  # a resumed study keeps its settings
-            specs = {row.name: env_spec(row.env) for row in study.rows}
+        specs = {row.name: env_spec(row.env) for row in study.rows}
+        if (folder / CONFIG_FILE).exists():  # a resumed study keeps its settings
+            results.check_unchanged(folder, study, specs)
+        else:
             results.write_config(folder, command, study, specs)
         own_tasks = {row.env.own_task for row in study.rows if row.env.own_task}
         fly = partial(_fly, study, own_tasks)
@@ -100,18 +102,14 @@ def _fly(study: Study, own_tasks: set[str], job: Job, tell: Tell) -> Done:
         load(task)
     if row.controller:
         policy = find_controller(row.agent)(env_spec(row.env))
-        times = {"env_steps": 0, "seconds": 0.0, "steps_per_second": np.nan}
         untrained = [Snapshot(env_steps=0, seconds=0.0, policy=policy)]
-        return Done(_evaluate(study, row, seed, untrained, times), None)
+        return Done(_evaluate(study, row, seed, untrained), None)
     run = row.run(seed)
     with open_env(study.wire, run.env, run.num_envs) as env:
         training = Training(run, env, snapshots=study.snapshots, keep_steps=study.keep_steps)
         training.train(tell=tell)
-    steps = training.log.env_steps
-    seconds = training.log.seconds
-    times = {"env_steps": steps, "seconds": seconds, "steps_per_second": steps / seconds}
     tell(run.env_steps, run.env_steps, "evaluating")
-    tables = _evaluate(study, row, seed, training.taken, times)
+    tables = _evaluate(study, row, seed, training.taken)
     tables["episodes"] = _episodes(training)
     if study.keep_steps:
         flown = _steps("train", **training.log.steps())
@@ -133,14 +131,15 @@ def open_env(
 
 
 def _evaluate(
-    study: Study, row: Row, seed: int, snapshots: Sequence[Snapshot], times: dict[str, float]
+    study: Study, row: Row, seed: int, snapshots: Sequence[Snapshot]
 ) -> dict[str, pd.DataFrame]:
     """Tables of the evaluation of all snapshots: the last on `study.episodes` episodes of its own,
     each before it on `study.curve_episodes` of the set `curve`.
     """
-    rows: list[dict[str, object]] = []
+    rows: list[Measures] = []
     flown: list[Trajectory] = []
     drones = row.env.drones
+    final = snapshots[-1]
     most = study.episodes
     if len(snapshots) > 1:
         most = max(most, study.curve_episodes)
@@ -148,14 +147,15 @@ def _evaluate(
     with open_env(study.wire, row.env.unseen(), worlds * drones) as env:
         headline = Headline.of(env.env_spec)
         for one in snapshots:
-            last = one is snapshots[-1]
+            last = one is final
             count = study.episodes if last else study.curve_episodes
             episodes = study.evaluation if last else "curve"
             flown = fly_episodes(env, one.policy, count, episodes, training_seed=seed)
-            label = {"row": row.name, "seed": seed}
-            label |= {"env_steps": one.env_steps, "seconds": one.seconds}
+            label = {"env_steps": one.env_steps, "seconds": one.seconds}
             rows += [label | measure_episode(each, headline) for each in flown]
     evaluations = pd.DataFrame(rows)
+    rate = final.env_steps / final.seconds if final.seconds else np.nan
+    times = {"env_steps": final.env_steps, "seconds": final.seconds, "steps_per_second": rate}
     measures = {**times, **measure_run(evaluations, headline)}
     tables = {"runs": pd.DataFrame([measures]), "evaluations": evaluations}
     if study.keep_steps:

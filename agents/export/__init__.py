@@ -53,7 +53,7 @@ def write_layers(writer: object, layers: Iterable[Layer]) -> None:
         name = type(layer).__name__
         write = getattr(writer, name.lower(), None)
         if write is None:
-            expected = "affine layers, convolutions, a GRU, nearness, relu and tanh"
+            expected = "affine layers, convolutions, a GRU, scaling, relu and tanh"
             raise InputError(f"export: expected {expected}, got {name}")
         write(layer)
 

@@ -17,7 +17,7 @@ from ...envs.spec import (
     component_units,
 )
 from ..convolutions import Convolution, Encoder
-from ..layers import Affine, Floats, Layer, Nearness
+from ..layers import BRIGHTEST, Affine, Floats, Layer, Scaling
 from ..memory import GRU
 from ..policies import NetworkPolicy, flat_size
 from . import write_layers
@@ -220,21 +220,21 @@ class _Program:
         self.tables[name] = values
         return f"rotorgram_{name}"
 
-    def _each(self, statement: str) -> None:
-        """A loop over the numbers so far."""
-        self.lines += [f"for (int i = 0; i < {self.size}; i++)", f"    {statement}"]
+    def _each(self, statement: str, place: slice | None = None) -> None:
+        """A loop over the numbers so far, or those of a place."""
+        place = place or slice(0, self.size)
+        loop = f"for (int i = {place.start}; i < {place.stop}; i++)"
+        self.lines += [loop, f"    {statement}"]
 
-    def nearness(self, layer: Nearness) -> None:
-        """Distances as nearness, in a copy of the observation."""
+    def scaling(self, layer: Scaling) -> None:
+        """Distances and pictures as networks see them, in a copy of the observation."""
         seen = self._array(self.size)
         self._each(f"{seen}[i] = observation[i];")
-        for place in layer.places:
-            self.lines += [
-                f"for (int i = {place.start}; i < {place.stop}; i++) {{",
-                f"    float half = {seen}[i] < 0.0f ? 0.0f : 0.5f * {seen}[i];",
-                f"    {seen}[i] = 2.0f / (1.0f + half) - 0.5f;",
-                "}",
-            ]
+        for place in layer.pictures:
+            self._each(f"{seen}[i] /= {BRIGHTEST}f;", place)
+        for place in layer.distances:
+            self._each(f"{seen}[i] = {seen}[i] < 0.0f ? 0.0f : 0.5f * {seen}[i];", place)
+            self._each(f"{seen}[i] = 2.0f / (1.0f + {seen}[i]) - 0.5f;", place)
 
     def _act(self, policy: NetworkPolicy) -> None:
         """Map the outputs to the range of the action, and clip them to its bounds."""

@@ -10,7 +10,7 @@ import onnx
 from onnx import TensorProto, helper, numpy_helper
 
 from ..convolutions import Convolution, Encoder
-from ..layers import Affine, Layer, Nearness
+from ..layers import BRIGHTEST, Affine, Layer, Scaling
 from ..memory import GRU
 from ..policies import NetworkPolicy, flat_size
 from . import write_layers
@@ -90,14 +90,18 @@ class _Graph:
         self.then("Squeeze", axis)
         self.nodes[-1].output[0] = self.at = "next_state"
 
-    def nearness(self, layer: Nearness) -> None:
-        """2 m / (1 + m x / 2) - m / 2 + (1 - m) x, where m is 1 for a distance and 0 otherwise.
+    def scaling(self, layer: Scaling) -> None:
+        """2 m / (1 + m x / 2) - m / 2 + f x, where m is 1 and f is 0 for a distance, m is 0 and f
+        is 1 / 255 for a picture, or 1.
 
         A distance below 0 counts as 0.
         """
         mask = np.zeros((1, self._size), np.float32)
-        for place in layer.places:
+        for place in layer.distances:
             mask[:, place] = 1.0
+        factor = np.float32(1.0) - mask
+        for place in layer.pictures:
+            factor[:, place] /= BRIGHTEST
         half = np.float32(0.5)
         self.then("Mul", half * mask)
         self.then("Relu")
@@ -106,7 +110,7 @@ class _Graph:
         self.then("Mul", mask / half)
         seen = self.then("Add", -half * mask)
         self.at = "observation"
-        others = self.then("Mul", np.float32(1.0) - mask)
+        others = self.then("Mul", factor)
         self.node("Add", seen, others)
 
     def _kept(self, constant: np.ndarray) -> str:

@@ -245,7 +245,7 @@ def test_another_format_is_refused(
     with monkeypatch.context() as patch:
         patch.setattr(checkpoints, "FORMAT", 1)
         store(kept, path)
-    with pytest.raises(CheckpointError, match="expected a checkpoint of format 5, got 1"):
+    with pytest.raises(CheckpointError, match="expected a checkpoint of format 6, got 1"):
         load(path)
 
 

@@ -100,7 +100,8 @@ def test_what_is_wrong_with_a_file(text: str, name: str, sentence: str, tmp_path
 
 def test_wrong_names(tmp_path: Path, capsys: Capsys) -> None:
     told = refused(capsys, "evaluate", "nowhere.py:Still")
-    assert told == ("rotorgram: controller: expected a file of Python, there is none: nowhere.py\n")
+    nowhere = Path("nowhere.py").absolute()
+    assert told == f"rotorgram: controller: expected a file of Python, got none: {nowhere}\n"
     assert "controller: expected FILE.py:CLASS, got still.py" in refused(
         capsys, "evaluate", "still.py"
     )

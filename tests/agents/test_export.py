@@ -88,6 +88,12 @@ def sighted() -> EnvSpec:
     return env_spec(sighted_config())
 
 
+def pictured() -> EnvSpec:
+    """Plain numbers, colours and a depth camera's picture."""
+    views = "down@9x6,down_depth@9x6"
+    return hover(cameras=views)
+
+
 def told_of(spec: EnvSpec) -> dict[str, str]:
     position = Position(env_steps=4096, seconds=0.0)
     about = {"algorithm": "a2c", "config": {}, "seed": 7, "env_steps": 4096, "position": position}
@@ -178,6 +184,7 @@ CASES: dict[str, Callable[[], NetworkPolicy]] = {
     "choice": lambda: policy_of(CHOICE, (16, 8), "tanh"),
     "by sight": lambda: policy_of(env_spec(EnvConfig(env_id="rotorgram/Forest-v0")), (16,), "tanh"),
     "by convolutions": lambda: policy_of(sighted(), (16,), "tanh", network="cnn"),
+    "by pictures": lambda: policy_of(pictured(), (16,), "tanh", network="cnn"),
     "of relu": lambda: policy_of(sighted(), (16,), network="cnn"),
     "linear": lambda: policy_of(spec_of(), ()),
 }

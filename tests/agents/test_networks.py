@@ -168,8 +168,22 @@ def test_activations_may_come_first_and_last() -> None:
     np.testing.assert_allclose(columns, 0.01, rtol=1e-5)
 
 
+def test_bytes_of_pictures_come_in_as_0_to_1() -> None:
+    """Others stay, as whole numbers of another range; the first sees 2 x, the second 1 + 5 x."""
+    pixels = ArraySpec(name="front", shape=(1, 1, 3), dtype="uint8", low=0.0, high=255.0)
+    count = ArraySpec(name="gates", shape=(1,), dtype="uint8", low=0.0, high=9.0)
+    network = MLP([count, pixels], 2, config_of((), "tanh"))
+    weights = bound(network)
+    weights.arrays["layers.0.weight"][:] = [[0, 2, 0, 0, 2], [1, 0, 5, 0, 0]]
+    inputs = np.array([[3.0], [51.0], [7.0], [255.0]], np.float32)
+    np.testing.assert_allclose(network.forward(inputs), [[8.0], [2.0]], rtol=1e-6)
+    by_inputs = network.back(np.array([[1.0], [1.0]], np.float32))
+    np.testing.assert_allclose(by_inputs, [[2.0], [5 / 255], [0.0], [2 / 255]], rtol=1e-6)
+
+
 def test_distances_come_in_as_nearness() -> None:
-    near = [ArraySpec(name=f"near {n}", shape=(1, n), low=0.0, unit="m") for n in (2, 1)]
+    shapes = ((1, 2), (1, 1, 1))  # of rays, and of a picture
+    near = [ArraySpec(name=f"near {s}", shape=s, low=0.0, unit="m") for s in shapes]
     plain = [ArraySpec(name=f"plain {n}", shape=(n,)) for n in (1, 2)]
     arrays = [plain[0], near[0], plain[1], near[1]]
     network = MLP(arrays, 2, config_of((4,), "tanh"))

@@ -123,13 +123,15 @@ def test_ctrl_c_while_a_dataclass_is_made_exits_with_130(
     assert done.stderr == "rotorgram: interrupted\n"
 
 
-def test_no_command_and_an_unknown_one(capsys: Capsys) -> None:
+def test_no_command_and_an_unknown_one(capsys: Capsys, monkeypatch: pytest.MonkeyPatch) -> None:
     assert run(capsys)[0] == 2
     status, _, err = run(capsys, "fly")
     assert status == 2
     assert err.count("\n") == 1
     assert "expected a command of sim, train, " in err
+    monkeypatch.delenv("PYTHONSAFEPATH", raising=False)
     out = output(capsys, "--version")
+    assert "PYTHONSAFEPATH" not in os.environ, "scripts that run later find their neighbours"
     assert re.fullmatch(r"rotorgram \d+\.\d+\.\d+\n", out)
 
 
@@ -827,7 +829,8 @@ def test_an_interrupted_comparison_goes_on(tmp_path: Path, capsys: Capsys) -> No
     runs = Results.read(folder).runs
     assert runs[runs.row == "vpg"].seed.tolist() == [0, 1, 2]
     assert len(list((folder / "runs").iterdir())) == len(runs)
-    assert "is finished" in refused(capsys, "compare", "--resume", folder)
+    again = output(capsys, "compare", "--resume", folder, "--no-film")
+    assert "runs done" in again, "nothing is left to fly: the report is drawn again"
 
 
 def test_a_killed_simulator_ends_a_training_with_a_sentence(tmp_path: Path) -> None:

@@ -1,6 +1,7 @@
 """Trajectories: in batches as one after the other, and from a journal as they were flown."""
 
 from contextlib import closing
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +22,7 @@ from rotorgram.flights.trajectories import (
     flown_trajectories,
     fly_episodes,
 )
+from rotorgram.models.errors import InputError
 from rotorgram.training.metrics import Headline, measure_episode
 from rotorgram.udp import RemoteVectorEnv, Simulator
 from rotorgram.udp.spawn import spawn_simulator
@@ -181,6 +183,33 @@ def test_a_journal_without_a_step_is_one_sentence(tmp_path: Path) -> None:
         recorded_trajectories(tmp_path / "text.mcap", [0])
     with pytest.raises(FileNotFoundError):
         recorded_trajectories(tmp_path / "nowhere.mcap", [0])
+
+
+def test_an_observation_may_have_the_name_of_telemetry() -> None:
+    """As that of another env of Gymnasium, whose numbers are no telemetry of ours."""
+    with closing(local()) as env:
+        named = replace(env.env_spec.observation[0], name="position")
+        env.env_spec = replace(env.env_spec, observation=(named,))
+        (flown,) = fly_episodes(env, PID(SPEC), 1, observations=["position"])
+    (usual,) = flown_trajectories(PID(SPEC), config_of(), [0])
+    np.testing.assert_array_equal(flown.telemetry["position"], usual.telemetry["position"])
+    assert flown.observations["position"].shape == (len(flown) + 1, 3)
+
+
+class Twisted:
+    """Gives two numbers where the env wants one."""
+
+    def reset(self) -> None:
+        pass
+
+    def act(self, observation: np.ndarray) -> np.ndarray:
+        return np.zeros(2, np.float32)
+
+
+def test_an_action_of_a_wrong_shape_is_one_sentence() -> None:
+    sentence = r"^twisted: expected an action of shape \(1,\), got \(2,\)$"
+    with pytest.raises(InputError, match=sentence):
+        flown_trajectories(Twisted(), CONFIG, [0])
 
 
 def test_random_trajectories_are_the_same_for_the_same_episode() -> None:

@@ -48,10 +48,16 @@ def test_points_are_where_rays_ended() -> None:
     assert np.isnan(right).all()  # nothing returned
 
 
+@pytest.mark.parametrize("late", [0, 3])
 @pytest.mark.parametrize("sampling", [{}, {"rate": 10.0, "delay": 0.04}])
-def test_points_of_a_flight_lie_on_the_ground(sampling: dict[str, float]) -> None:
+def test_points_of_a_flight_lie_on_the_ground(sampling: dict[str, float], late: int) -> None:
     """Also those of a reading that was taken some steps before, of a craft that moved on."""
-    config = EnvConfig.from_keywords(HOVER, sensors={"tof": {**DOWN, **sampling}}, start_tilt=20.0)
+    config = EnvConfig.from_keywords(
+        HOVER,
+        sensors={"tof": {**DOWN, **sampling}},
+        start_tilt=20.0,
+        randomize={"observation_delay": late, "mass": "uniform(0.9, 1.1)"},
+    )
     (flown,) = flown_trajectories(None, config, [0])
     assert len(flown) > 10
     for moment in moments(flown):

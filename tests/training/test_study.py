@@ -177,7 +177,6 @@ def test_ctrl_c_keeps_what_is_done(tmp_path: Path, capsys: Capsys) -> None:
     assert len(merged) == len(kept)
     resume = ("--resume", folder)
     for words, sentence in (
-        (("sweep", "vpg", *resume), "is finished; draw its report with: rotorgram report"),
         (("sweep", "vpg", *resume, "--seeds", 3), "got others by --seeds"),
         (("compare", *resume), "expected a folder of rotorgram compare"),
     ):
@@ -244,6 +243,47 @@ def test_a_board_takes_own_tasks_and_changes(
     page = (tmp_path / "o" / "results.md").read_text()
     assert "| PPO tuned steps_per_update=256 (2 seeds; 4,096 env steps) |" in page
     assert "| Geometric (2 seeds) |" in page
+
+
+CONTROLLER = """
+import numpy as np
+
+class Falls:
+    options = {}
+
+    def __init__(self, spec):
+        self.action = np.full(spec.action.shape, spec.action.low)
+
+    def reset(self):
+        pass
+
+    def act(self, observation):
+        return self.action
+"""
+
+
+def test_a_study_goes_on_with_the_code_that_it_began_with(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Capsys
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    texts = {"falls.py": CONTROLLER, "heavy_task.py": OWN_TASK.replace("Near", "Heavy")}
+    for file, text in texts.items():
+        (tmp_path / file).write_text(text)
+    settings = ("--env", "heavy_task:Heavy-v0", "--no-udp", "--seeds", 2, "--episodes", 1)
+    more = ("--episode-length", 5, "--jobs", 1, "--no-film")
+    output(capsys, "compare", "--agents", "falls.py:Falls", *settings, *more, "--out", "out")
+    content = json.loads((tmp_path / "out" / "config.json").read_text())
+    assert len(content["sources"]["falls"]) == 32
+    (tmp_path / "out" / "runs" / "falls-seed1.parquet").unlink()
+    words = {"falls.py": "falls.py:Falls", "heavy_task.py": "task, vehicle or scene"}
+    for file, changed in words.items():
+        (tmp_path / file).write_text(texts[file] + "# another\n")
+        status, out, err = run(capsys, "compare", "--resume", "out")
+        assert (status, out) == (1, "")
+        sentence = f"resume: falls: expected the {changed} with which out began, got another"
+        assert err == f"rotorgram: {sentence}\n"
+        (tmp_path / file).write_text(texts[file])
+    assert "2 of 2 runs done" in output(capsys, "compare", "--resume", "out", "--no-film")
 
 
 def test_a_controller_brings_its_options_and_stands_in_the_table_of_its_task() -> None:
