@@ -78,7 +78,7 @@ class AdvancingVectorEnv(VectorEnv[Observation, ArrayLike, Array]):
     @abstractmethod
     def advance(
         self,
-        actions: Array,
+        actions: ArrayLike,
         resets: Array | None = None,
         seeds: Seeds | None = None,
         frozen: Array | None = None,
@@ -97,7 +97,7 @@ class AdvancingVectorEnv(VectorEnv[Observation, ArrayLike, Array]):
         """Fly every drone for one control period; after an episode the autoreset mode decides."""
         mode = self.autoreset_mode
         resets = self.done if mode == AutoresetMode.NEXT_STEP and some(self.done) else None
-        self.advance(self._shaped(actions), resets)
+        self.advance(actions, resets)
         step = (self.rewards, self.terminated, self.truncated, self._info(self._everybody))
         if mode == AutoresetMode.SAME_STEP and some(self.done):
             step = self._begin_next(*step)
@@ -121,14 +121,6 @@ class AdvancingVectorEnv(VectorEnv[Observation, ArrayLike, Array]):
         self.control_period = spec.control_period
         fps = max(1, round(1 / spec.control_period))
         self.metadata = {"render_modes": [], "render_fps": fps, "autoreset_mode": mode}
-
-    def _shaped(self, actions: ArrayLike) -> Array:
-        array = np.asarray(actions)
-        expected = self.action_space.shape
-        if array.shape != expected:
-            got = f"got shape {array.shape}"
-            raise InputError(f"actions: expected an array of shape {expected}, {got}")
-        return array
 
     def _no_actions(self) -> Array:
         return np.zeros(self.action_space.shape or (), np.float32)

@@ -20,7 +20,7 @@ from ..sim.compile.llvm import Region, compiled, widest
 from ..sim.snapshots import Arrays, Snapshot, joined, part_of
 from ..sim.state import ByName
 from ..sim.world import Call
-from .autoreset import Seeds, Told
+from .autoreset import Array, Seeds, Told
 from .derivative import Before, Derivative
 from .loop import Loop
 from .stages.record import Mask, Record
@@ -147,12 +147,12 @@ class Machine:
 
     def step(
         self,
-        sent: np.ndarray | None,
+        sent: Array | None,
         flown: Mask | None,
         begun: Mask | None,
         active: Mask | None,
         seeds: Seeds | None = None,
-    ) -> tuple[np.ndarray, Told]:
+    ) -> tuple[Array, Told]:
         """Run all regions. Returns what leaves the loop, by name, (N, ...), and `Loop.told`.
 
         Actions (W, A, k), None if nobody flies; masks as of a `Record`; seeds of worlds, (W,).
@@ -186,7 +186,7 @@ class Machine:
         self._call(_LAST)
         return np.ndarray((), self._results, new), lambda: self._read(new)
 
-    def moment(self, results: np.ndarray) -> ByName:
+    def moment(self, results: Array) -> ByName:
         """As `Loop._moment` after a step."""
         seen = {"keys": self.memory.get(_KEYS), "episode": self.memory.get(_EPISODE)}
         for name in self._loop.sight():
@@ -267,7 +267,7 @@ class Machine:
             if values is not None and values.ndim:
                 self.memory.put(name, values)
 
-    def _read(self, content: np.ndarray) -> tuple[Named, Named]:
+    def _read(self, content: Array) -> tuple[Named, Named]:
         """Telemetry and terms of the reward, float64, shape (N, n) and (N,), of a step."""
         telemetry = {}
         terms = {}

@@ -6,10 +6,11 @@ import numpy as np
 
 from ..models.errors import InputError, require
 from ..sim.snapshots import Arrays, Snapshot
+from .actions import Actions
 from .autoreset import AdvancingVectorEnv, Observation
 from .info import Info
 from .rendering import RENDER_MODES
-from .spaces import action_space, checked_action, observation_space
+from .spaces import action_space, observation_space
 from .vector import LocalVectorEnv
 
 require("pettingzoo", "swarm", "the parallel env")
@@ -45,6 +46,7 @@ class AdvancingParallelEnv(ParallelEnv[str, Any, Any]):  # type: ignore[misc]
         self._rows = {agent: row for row, agent in enumerate(names)}
         self.observation_spaces = {agent: observation_space(self.env_spec) for agent in names}
         self.action_spaces = {agent: action_space(self.env_spec) for agent in names}
+        self._actions = Actions.of(self.env_spec.action, 1)
 
     def observation_space(self, agent: str) -> Any:
         """The same object for an agent in every call."""
@@ -72,11 +74,9 @@ class AdvancingParallelEnv(ParallelEnv[str, Any, Any]):  # type: ignore[misc]
             got = sorted(actions) if isinstance(actions, dict) else type(actions).__name__
             raise InputError(f"actions: expected a dict with {', '.join(flown)}, got {got}")
         given = np.zeros(world.action_space.shape or (), world.action_space.dtype)
-        with np.errstate(over="ignore"):  # an overflow is infinite, and refused as such
-            for agent in flown:
-                space = self.action_spaces[agent]
-                name = f"actions of {agent}"
-                given[self._rows[agent]] = checked_action(actions[agent], space, name)
+        for agent in flown:
+            action = self._actions.checked(actions[agent], name=f"action of {agent}")
+            given[self._rows[agent]] = action[0]
         seen, rewards, terminated, truncated, info = world.step(given)
         self.agents = [agent for agent in flown if not world.out[self._rows[agent]]]
         observations, infos = self._told(seen, info, flown)

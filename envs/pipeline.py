@@ -4,8 +4,9 @@ import numpy as np
 
 from ..sim import World
 from ..sim.sensors import SENSOR_TYPES, Sensors
+from .actions import Actions
 from .specification import observed
-from .stages.actions import ActionDelay, Actions, Receive
+from .stages.actions import ActionDelay, Receive
 from .stages.clock import Clock
 from .stages.ends import Ends
 from .stages.flight import Control, Flight, StandStill
@@ -50,7 +51,9 @@ class Pipeline:
             sensors = Sensors(config.sensors, world, period)
         if sensors is not None and config.estimated:
             look = sensors.seen
-        self.actions = Actions(world.shape, len(controller.low), controller.choices)
+        self.actions = Actions(
+            world.shape, (len(controller.low),), np.dtype(np.float32), controller.choices
+        )
         neutral = self.actions.neutral()
         substeps = task.vehicle.substeps(period)
         # An estimate is computed once in a control step, and so is a thrust that follows from it.

@@ -62,11 +62,8 @@ class Renderer:
         pictures = []
         for first in range(0, len(now), drones):
             scene = self._scene(first // drones)
-            if self._canvas is not None and scene != self._drawn:
-                self.close()
             if self._canvas is None:
                 self._canvas = Canvas(self._stage(scene, trail=one), *size)
-                self._drawn = scene
             canvas = self._canvas
             canvas.stage.show(*now[first : first + drones])
             pictures.append(canvas.draw())
@@ -77,10 +74,7 @@ class Renderer:
 
         shown = now[: len(self._loop.spec.agents)]  # of the first world
         scene = self._scene(0)
-        if self._view is not None and scene != self._drawn:
-            self.close()
         if self._view is None:
-            self._drawn = scene
             pace = live.Pace(self._loop.spec.control_period)
             self._view = live.LiveView(self._stage(scene, trail=True), pace)
         if shown != self._shown:  # `step` shows by itself, and a script may ask once more
@@ -88,9 +82,13 @@ class Renderer:
             self._view.draw_in_time(*shown)
 
     def _scene(self, world: int) -> SceneConfig:
-        """What surrounds the drones of a world."""
+        """What surrounds the drones of a world. A canvas or a window of another is closed."""
         scenery = self._loop.world.scenery
-        return scenery.scene.with_seed(int(scenery.seeds[world])).shown
+        scene = scenery.scene.with_seed(int(scenery.seeds[world])).shown
+        if scene != self._drawn:
+            self.close()
+            self._drawn = scene
+        return scene
 
     def _stage(self, scene: SceneConfig, *, trail: bool) -> "Stage":
         """Of a world."""

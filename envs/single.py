@@ -13,7 +13,7 @@ from .compiled import make_loop
 from .config import EnvConfig
 from .info import Info, LazyInfo
 from .rendering import RENDER_MODES, Renderer
-from .spaces import action_space, checked_action, joined, observation_space, telemetry_names
+from .spaces import action_space, joined, observation_space, telemetry_names
 
 
 class SingleEnv(gym.Env[Observation, ArrayLike]):
@@ -77,7 +77,7 @@ class SingleEnv(gym.Env[Observation, ArrayLike]):
     def step(self, action: ArrayLike) -> tuple[Observation, float, bool, bool, Info]:
         """Fly for one control period. See the task for shapes, units and ends."""
         loop = self._loop
-        loop.advance(checked_action(action, self.action_space, "action"))
+        loop.advance(action)
         if self.render_mode == "human":
             self.render()
         flags = loop.terminated.item(), loop.truncated.item()

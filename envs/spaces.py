@@ -6,7 +6,6 @@ from typing import Any
 import numpy as np
 from gymnasium import spaces
 
-from ..models.errors import InputError, shortened
 from .spec import ArraySpec, Discrete, EnvSpec, component_names
 
 
@@ -34,25 +33,6 @@ def action_space(spec: EnvSpec) -> spaces.Space[Any]:
     if isinstance(spec.action, Discrete):
         return spaces.Discrete(spec.action.choices)
     return box(spec.action)
-
-
-def checked_action(action: object, space: spaces.Space[Any], name: str) -> np.ndarray:
-    """A single env's action as an array of its space's shape. Raises `InputError`."""
-    if isinstance(space, spaces.Discrete):
-        if not space.contains(action):
-            expected = f"a whole number 0 to {space.n - 1}"
-            raise InputError(f"{name}: expected {expected}, got {shortened(action)}")
-        return np.asarray(action)
-    try:
-        array = np.asarray(action)
-    except ValueError:
-        array = np.asarray(None)
-    expected = f"{name}: expected an array of shape {space.shape}"
-    if array.dtype.kind not in "iuf":
-        raise InputError(f"{expected} of real numbers, got {shortened(action)}")
-    if array.shape != space.shape:
-        raise InputError(f"{expected}, got {array.shape}")
-    return array
 
 
 def joined(spec: EnvSpec, arrays: Mapping[str, np.ndarray]) -> Any:

@@ -2,7 +2,6 @@
 
 from typing import Any
 
-import numpy as np
 from gymnasium.vector import AutoresetMode, VectorEnv
 from numpy.typing import ArrayLike
 
@@ -11,6 +10,7 @@ from ..models.fields import check_names
 from ..sim.snapshots import Arrays, Snapshot
 from .autoreset import (
     AdvancingVectorEnv,
+    Array,
     Observation,
     Seeds,
     Told,
@@ -24,7 +24,7 @@ from .rendering import RENDER_MODES, Renderer
 from .spaces import joined
 
 
-class LocalVectorEnv(AdvancingVectorEnv, VectorEnv[Observation, ArrayLike, np.ndarray]):
+class LocalVectorEnv(AdvancingVectorEnv, VectorEnv[Observation, ArrayLike, Array]):
     """N drones that fly a task in process, bit for bit as N single ones do.
 
     With several `drones` to a world, N is a multiple of them. One whose episode ends is `out`, with
@@ -93,7 +93,7 @@ class LocalVectorEnv(AdvancingVectorEnv, VectorEnv[Observation, ArrayLike, np.nd
         self.advance(self._no_actions(), mask, checked_seeds(seed, self.num_envs), ~mask)
         return self.observations, self._info(mask)
 
-    def render(self) -> tuple[np.ndarray, ...] | None:
+    def render(self) -> tuple[Array, ...] | None:
         """With `rgb_array` a picture of each drone, uint8, shape (180, 240, 3); otherwise None."""
         return self._renderer.render()
 
@@ -104,10 +104,10 @@ class LocalVectorEnv(AdvancingVectorEnv, VectorEnv[Observation, ArrayLike, np.nd
 
     def advance(
         self,
-        actions: np.ndarray,
-        resets: np.ndarray | None = None,
+        actions: ArrayLike,
+        resets: Array | None = None,
         seeds: Seeds | None = None,
-        frozen: np.ndarray | None = None,
+        frozen: Array | None = None,
     ) -> None:
         """See the base."""
         loop = self.loop
@@ -126,7 +126,7 @@ class LocalVectorEnv(AdvancingVectorEnv, VectorEnv[Observation, ArrayLike, np.nd
         self._take_results()
 
     @property
-    def headline(self) -> np.ndarray:
+    def headline(self) -> Array:
         """The metric that decides, float64, shape (N,); NaN where the task has none."""
         return self.loop.headline
 

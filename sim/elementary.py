@@ -49,16 +49,17 @@ _DOUBLE = _precision(**_TABLES["float64"])
 # ---- of arrays, and of numbers, which are Python's
 
 
-def _of_numbers(function: Callable[..., Array]) -> Callable[..., Array]:
-    """Python's numbers, alone, give one of them: computed in float64."""
+def _elementary(function: Callable[..., Array]) -> Callable[..., Array]:
+    """Its compiled code is there once. Python's numbers, alone, give one, computed in float64."""
+    of_arrays = once()(function)
 
     @wraps(function)
     def call(*values: Array) -> Array:
         for value in values:
             if not isinstance(value, float | int):
-                return function(*values)
+                return of_arrays(*values)
         with np.errstate(all="ignore"):
-            return function(*map(np.float64, values)).item()
+            return of_arrays(*map(np.float64, values)).item()
 
     return call
 
@@ -100,15 +101,13 @@ def polynomial(x: Array, coefficients: Sequence[float]) -> Array:
 # ---- of angles
 
 
-@_of_numbers
-@once()
+@_elementary
 def sin(x: Array) -> Array:
     """Sine of an angle, rad, within 2.5 ulp; NaN beyond 3e6, of float32 beyond 2e4."""
     return _wave(x, 0.0)
 
 
-@_of_numbers
-@once()
+@_elementary
 def cos(x: Array) -> Array:
     """Cosine of an angle, as `sin`."""
     return _wave(x, 1.0)
@@ -129,8 +128,7 @@ def _wave(x: Array, quarters: float) -> Array:
     return np.where(quarter >= 2.0, -value, value)
 
 
-@_of_numbers
-@once()
+@_elementary
 def wrapped(x: Array) -> Array:
     """The angle between -π and π, rad, that differs from x by whole turns; NaN as of `sin`."""
     p = _constants(x)
@@ -145,8 +143,7 @@ def _without(p: SimpleNamespace, x: Array, quarters: Array) -> Array:
     return x
 
 
-@_of_numbers
-@once()
+@_elementary
 def atan2(y: Array, x: Array) -> Array:
     """Angle of the point (x, y), rad, within 2.5 ulp, for sizes below 1e37; zeros as in C."""
     p = _constants(y, x)
@@ -175,8 +172,7 @@ def atan2(y: Array, x: Array) -> Array:
 # ---- exponentials
 
 
-@_of_numbers
-@once()
+@_elementary
 def exp(x: Array) -> Array:
     """Exponential function, within 2.5 ulp.
 
@@ -189,8 +185,7 @@ def exp(x: Array) -> Array:
     return _ended(p, x, value)
 
 
-@_of_numbers
-@once()
+@_elementary
 def expm1(x: Array) -> Array:
     """exp(x) - 1, within 2.5 ulp; infinite where `exp` is."""
     p = _constants(x)
@@ -215,8 +210,7 @@ def _ended(p: SimpleNamespace, x: Array, value: Array) -> Array:
     return np.where(x == x, value, x)
 
 
-@_of_numbers
-@once()
+@_elementary
 def log(x: Array) -> Array:
     """Natural logarithm, within 2.5 ulp, as fdlibm's e_log.c.
 

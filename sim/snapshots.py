@@ -5,6 +5,8 @@ from typing import ClassVar
 
 import numpy as np
 
+from .state import Array
+
 Snapshot = dict[str, np.ndarray]
 Arrays = Mapping[str, np.ndarray]
 
@@ -24,13 +26,8 @@ class Kept:
 
     def snapshot(self) -> Snapshot:
         """Copies by name; attributes without a value yet are left out."""
-        own = {}
-        for name in self.arrays:
-            value = getattr(self, name)
-            if value is not None:
-                own[name] = np.copy(value)
-        parts = {name: part.snapshot() for name, part in self.parts().items() if part}
-        return own | joined(parts)
+        own = {name: getattr(self, name) for name in self.arrays}
+        return joined(own | {name: part.snapshot() for name, part in self.parts().items() if part})
 
     def restore(self, arrays: Arrays) -> None:
         """Put a snapshot back."""
@@ -42,12 +39,14 @@ class Kept:
                 part.restore(part_of(arrays, name))
 
 
-def joined(parts: Mapping[str, Arrays]) -> Snapshot:
-    """Arrays of several parts under the name of the part and their own."""
-    joint = {}
-    for part, arrays in parts.items():
-        for name, array in arrays.items():
-            joint[f"{part}/{name}"] = array
+def joined(parts: Mapping[str, Array]) -> Snapshot:
+    """Copies of arrays by name; those of a part, a mapping, after its name. None is left out."""
+    joint: Snapshot = {}
+    for name, part in parts.items():
+        if isinstance(part, Mapping):
+            joint |= {f"{name}/{own}": array for own, array in joined(part).items()}
+        elif part is not None:
+            joint[name] = np.copy(part)
     return joint
 
 

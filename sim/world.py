@@ -226,10 +226,9 @@ class World(NotCopied):
         """Copies of all arrays that a later step depends on, by name."""
         state = {name: getattr(self.state, name) for name in self.of_state}
         state |= {name: getattr(self, name) for name in self.arrays}
-        parts: dict[str, Arrays] = {"state": state | self.hidden(), "parameters": self.parameters}
+        parts: ByName = {"state": state | self.hidden(), "parameters": self.parameters}
         kept = {"random": self.random, "effects": self.effects, "scenery": self.scenery}
-        parts |= {name: one.snapshot() for name, one in kept.items()}
-        return {name: np.copy(x) for name, x in joined(parts).items() if x is not None}
+        return joined(parts | {name: one.snapshot() for name, one in kept.items()})
 
     def restore(self, arrays: Arrays) -> None:
         """Put a snapshot back; no step runs. No later bit differs from those that followed it."""

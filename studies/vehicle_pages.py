@@ -138,8 +138,8 @@ def sensors(vehicle: Vehicle) -> list[str]:
     """Sensors whose coefficients a vehicle has."""
     able = []
     for name, kind in SENSOR_TYPES.items():
-        settings = [one for one in kind.settings.values() if one.default is None]
-        needs = [vehicle.coefficients[one.coefficient] for one in settings]
+        settings = [one for one in kind.about.settings.values() if one.default is None]
+        needs = [vehicle.coefficients[one.coefficient] for one in settings if one.coefficient]
         if None not in needs:
             able.append(name)
     return able

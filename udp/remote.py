@@ -9,6 +9,7 @@ import numpy as np
 from gymnasium.vector import AutoresetMode, VectorEnv
 from numpy.typing import ArrayLike
 
+from ..envs.actions import Actions
 from ..envs.autoreset import (
     LOST,
     AdvancingVectorEnv,
@@ -22,10 +23,9 @@ from ..envs.autoreset import (
 )
 from ..envs.info import Info
 from ..envs.spaces import action_space, joined, observation_space, telemetry_names
-from ..envs.spec import ArraySpec, Discrete, EnvSpec
+from ..envs.spec import ArraySpec, EnvSpec
 from ..models.errors import InputError, NotCopied
 from ..models.fields import Limits, OrNone, check
-from .layouts import layout_of
 from .protocol.client import Address
 from .protocol.layout import MAX_DRONES, Array
 from .protocol.messages import FLY, FREEZE, MAX_UINT64, RESET
@@ -78,12 +78,10 @@ class _Remote(NotCopied):
         """Counts and round trips of the wire, over all simulators."""
         return self._agent.server.statistics
 
-    def _take_actions(self, spec: EnvSpec, count: int) -> None:
-        """Take dtype and shape of the actions of so many drones as they cross the wire."""
-        slot = layout_of(spec).actions
-        self._row = slot.shape[1:]
-        self._dtype = slot.dtype
-        self._nothing: Array = np.zeros((count, *self._row), self._dtype)
+    def _take_actions(self, spec: EnvSpec, drones: int) -> None:
+        """Take what the actions of so many drones are."""
+        self._actions = Actions.of(spec.action, drones)
+        self._nothing: Array = np.zeros(self._actions.shape, self._actions.dtype)
 
 
 class RemoteEnv(_Remote, gym.Env[Observation, ArrayLike]):
@@ -166,10 +164,10 @@ class RemoteEnv(_Remote, gym.Env[Observation, ArrayLike]):
         """Fly for one control period. The action is sent in the dtype of its space."""
         if not self._flying:
             raise gym.error.ResetNeeded("step: expected a call of reset() first")
-        actions = np.asarray(action)
-        if actions.dtype != self._dtype or actions.shape != self._row:
-            actions = _checked_actions(actions, self._dtype, self._row)
-        actions = actions[np.newaxis]
+        usual = self._nothing
+        actions = np.asarray(action)[np.newaxis]
+        if actions.dtype != usual.dtype or actions.shape != usual.shape:
+            actions = self._actions.checked(action)
         self._flying = False  # until the answer is there
         try:
             self._agent.exchange({0: (actions, _FLY, None)})
@@ -323,7 +321,7 @@ class RemoteVectorEnv(_Remote, AdvancingVectorEnv, VectorEnv[Observation, ArrayL
 
     def advance(
         self,
-        actions: Array,
+        actions: ArrayLike,
         resets: Array | None = None,
         seeds: Seeds | None = None,
         frozen: Array | None = None,
@@ -341,7 +339,8 @@ class RemoteVectorEnv(_Remote, AdvancingVectorEnv, VectorEnv[Observation, ArrayL
         if waiting.any():
             first = int(waiting.argmax())
             raise gym.error.ResetNeeded(f"step: expected a call of reset() for env {first} first")
-        sent = self._sent(actions, still)
+        sent = np.array(self._actions.checked(actions, ~still))
+        sent[still] = 0
         before = self._arrays, self.telemetry
         reasons = self._exchange(sent, resets, self._seeds(seeds), frozen)
         self._take_states(still)
@@ -412,25 +411,6 @@ class RemoteVectorEnv(_Remote, AdvancingVectorEnv, VectorEnv[Observation, ArrayL
         self.terminated = np.concatenate([s.terminated for s in states]) & ~still
         self.truncated = np.concatenate([s.truncated for s in states]) & ~still
 
-    def _sent(self, actions: Array, idle: Array) -> Array:
-        """Actions as they cross the wire; those of drones that do not fly are 0."""
-        shape = (self.num_envs, *self._row)
-        action = self.env_spec.action
-        array = np.array(actions)
-        if isinstance(action, Discrete) and array.shape == (*shape, 1):
-            array = array[:, 0]
-        if array.shape == shape:
-            array[idle] = 0
-        sent = _checked_actions(array, self._dtype, shape)
-        right = np.isfinite(sent)
-        expected = "finite numbers"
-        if isinstance(action, Discrete):
-            right = (sent >= 0) & (sent < action.choices)
-            expected = f"0 to {action.choices - 1}"
-        if not right.all():
-            raise InputError(f"action: expected {expected}, got {sent[~right][0]}")
-        return sent
-
     def _no_actions(self) -> Array:
         return self._nothing
 
@@ -443,24 +423,3 @@ def _by_name(specs: Sequence[ArraySpec], states: Sequence[Sequence[Array]]) -> A
     """The arrays of several simulators, one after the other."""
     parts = zip(*states, strict=True)
     return {spec.name: np.concatenate(part) for spec, part in zip(specs, parts, strict=True)}
-
-
-def _checked_actions(action: ArrayLike, dtype: np.dtype, shape: tuple[int, ...]) -> Array:
-    """Actions as they cross the wire; the env checks bounds.
-
-    Raises `InputError` for another shape, and what is not real or cannot be of that dtype.
-    """
-    array = np.asarray(action)
-    is_real = dtype.kind == "f"
-    kinds = "iuf" if is_real else "iu"
-    if array.shape != shape or array.dtype.kind not in kinds:
-        numbers = "real" if is_real else "whole"
-        raise InputError(
-            f"action: expected {numbers} numbers of shape {shape}, "
-            f"got {array.dtype} of shape {array.shape}"
-        )
-    with np.errstate(over="ignore", under="ignore"):  # independent of the program's settings
-        sent = array.astype(dtype)  # an overflow is infinite, and refused as such
-    if not is_real and (sent != array).any():
-        raise InputError(f"action: expected numbers of {dtype}, got {array}")
-    return sent

@@ -120,15 +120,8 @@ class Record:
     def snapshot(self) -> Snapshot:
         """Copies of what is kept and of the memory, by name."""
         known = vars(self)
-        plain: dict[str, Any] = {}
-        parts = {"memory": vars(self.memory), "kept": plain}
-        for name in self.kept:
-            values = known.get(name)
-            if isinstance(values, Mapping):
-                parts[name] = {**values}
-            elif values is not None:
-                plain[name] = values
-        return {name: np.copy(values) for name, values in joined(parts).items()}
+        kept = {name: known.get(name) for name in self.kept}
+        return joined({"memory": vars(self.memory), "kept": kept})
 
     def restore(self, arrays: Arrays) -> None:
         """Put a snapshot back."""
@@ -138,13 +131,13 @@ class Record:
         vars(self.memory).clear()
         with self.memory.open("begin"):
             for key, array in arrays.items():
-                part, _, name = key.partition("/")
+                part, name, *inner = key.split("/", 2)
                 if part == "memory":
                     setattr(self.memory, name, array.copy())
-                elif part == "kept":
-                    known[name] = array.copy()
+                elif inner:
+                    known.setdefault(name, {})[inner[0]] = array.copy()
                 else:
-                    known.setdefault(part, {})[name] = array.copy()
+                    known[name] = array.copy()
         if self.has_begun:
             known.setdefault("metrics", {})  # of a task that has none
         self.flown = self.begun = None
@@ -231,8 +224,3 @@ def merged(mask: Mask, new: Any, old: Any) -> Any:
     if isinstance(new, Mapping):
         return {name: merged(mask, value, old[name]) for name, value in new.items()}
     return chosen(mask, new, old)
-
-
-def is_finite(values: np.ndarray) -> bool:
-    """Whether all numbers are finite."""
-    return values.dtype.kind != "f" or np.count_nonzero(np.isfinite(values)) == values.size

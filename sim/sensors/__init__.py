@@ -18,18 +18,19 @@ from ..state import Array, ByName, WorldState, chosen
 from ..world import World
 from . import range_sensors
 from .barometer import Barometer
-from .base import Sensor, Source, Values
+from .base import Sensor, Source, Values, checked_settings
 from .estimator import Estimator
 from .imu import Imu
 from .simple import Gps, Magnetometer, MotionCapture, Rangefinder
 
 SENSOR_TYPES: Final[Mapping[str, type[Sensor]]] = {
-    kind.name: kind for kind in (Imu, Magnetometer, Barometer, Rangefinder, Gps, MotionCapture)
+    kind.about.name: kind
+    for kind in (Imu, Magnetometer, Barometer, Rangefinder, Gps, MotionCapture)
 }
 """In this order they are observed."""
 
 Settings = dict[str, Any]
-_ESTIMATE = Estimator.name
+_ESTIMATE = Estimator.about.name
 _OBSERVED = Choice(("added", _ESTIMATE))
 
 
@@ -53,8 +54,10 @@ def checked_sensors(given: object) -> Settings:
             raise InputError(
                 f"sensors.{name}: expected true, or settings by name, got {shortened(settings)}"
             )
-        kind = SENSOR_TYPES.get(name)
-        sensors[name] = kind.checked(settings) if kind else range_sensors.checked(name, settings)
+        if name in SENSOR_TYPES:
+            sensors[name] = checked_settings(name, SENSOR_TYPES[name].about.settings, settings)
+        else:
+            sensors[name] = range_sensors.checked(name, settings)
     if check("sensors.estimate", Flag(), given.get(_ESTIMATE, False)):
         sensors[_ESTIMATE] = True
     observe = check("sensors.observe", _OBSERVED, given.get("observe", "added"))
@@ -85,17 +88,18 @@ def readings_of(sensors: Values, vehicle: "models.Vehicle", period: float) -> li
     settings = _resolved(sensors, vehicle, period)
     kinds: list[type[Source]] = [*SENSOR_TYPES.values(), Estimator]
     for kind in kinds:
-        if kind.name not in sensors:
+        about = kind.about
+        if about.name not in sensors:
             continue
-        low, high = kind.bounds(settings.get(kind.name, {}))
+        low, high = kind.bounds(settings.get(about.name, {}))
         reading = {
-            "name": kind.name,
+            "name": about.name,
             "shape": (len(low),),
             "low": low,
             "high": high,
-            "unit": kind.units,
-            "frame": kind.frame,
-            "components": kind.components,
+            "unit": about.units,
+            "frame": about.frame,
+            "components": about.components,
         }
         readings.append(reading)
     return [] if "observe" in sensors else readings

@@ -1,12 +1,10 @@
 """Barometer."""
 
 import math
-from typing import ClassVar
 
-from ...models.fields import Limits
 from ..elementary import power
 from ..state import Array, chosen, clip
-from .base import Bounds, Sensor, Setting, Values, coefficients
+from .base import ABOUT, Bounds, Sensor, Values
 
 SEA_LEVEL_PRESSURE = 101_325.0  # Pa. These are those of ISO 2533:1975
 SEA_LEVEL_TEMPERATURE = 288.15  # K
@@ -41,16 +39,8 @@ class Barometer(Sensor):
     body's origin. Setting: the height of the ground above sea level.
     """
 
-    name = "barometer"
-    columns = 2
+    about = ABOUT["barometer"]
     arrays = (*Sensor.arrays, "_bias")
-    settings: ClassVar = {
-        **coefficients("barometer_", "noise", walk=0.0),
-        "altitude": Setting(0.0, Limits(-1e3, 9e3, "m")),
-    }
-    frame = "above sea level"
-    components = ("pressure altitude",)
-    units = ("m",)
 
     _bias: Array = None
 

@@ -10,15 +10,13 @@ import numpy as np
 from ... import models
 from ...models import InputError
 from ...models.coefficients import COEFFICIENTS
-from ...models.fields import Limits, check, check_names
+from ...models.fields import Limits, Rule, check, check_names
+from ...models.files import read_own_toml
 from ..snapshots import Kept
 from ..state import Array, chosen, clip, some
 from ..world import World
 
-FURTHEST = 1e5  # Largest coordinate of a reading, m
-MAX_SPEED = 1e3  # Largest speed of a reading along an axis, m/s
 MAX_DELAY = 1000  # Longest delay, control steps
-UNIT = 1.001  # Bound of a unit quaternion's components
 
 Values = Mapping[str, Any]
 """Settings by name: numbers, tuples of numbers, None."""
@@ -30,7 +28,7 @@ class Setting(NamedTuple):
     """A setting of a sensor."""
 
     default: float | tuple[float, ...] | None
-    limits: Limits
+    limits: Rule
     coefficient: str = ""
     """The coefficient of the vehicle that replaces the default.
 
@@ -38,47 +36,64 @@ class Setting(NamedTuple):
     """
 
 
-def coefficients(prefix: str, *needs: str, **defaults: float) -> dict[str, Setting]:
-    """Settings that a vehicle's file may give, by the prefix and their names.
+class About(NamedTuple):
+    """What `sensors.toml` says of a sensor, or of the estimate."""
 
-    Those of `needs` have no default: the vehicle or the option has to give them.
-    """
-    settings = {}
-    for name in (*needs, *defaults):
-        coefficient = f"sensors.{prefix}{name}"
-        settings[name] = Setting(defaults.get(name), COEFFICIENTS[coefficient], coefficient)
-    return settings
+    name: str
+    """In the option `sensors`, and of the observation's array."""
+    frame: str
+    components: tuple[str, ...]
+    units: tuple[str, ...]
+    settings: Mapping[str, Setting]
+    top: tuple[float, ...] = ()
+    """Upper bound of each component, unless `bounds` computes it."""
+    normals: int = 0
+    """Normal numbers that a reading takes; `draw` gets as many at a reset."""
 
 
-SAMPLING = {
-    # Readings per second: the control rate over a whole number. None: the control rate.
-    "rate": Setting(None, Limits(1e-3, 1e6, "Hz")),
-    # Age of a reading when it is observed: a whole number of control periods.
-    "delay": Setting(0.0, Limits(0.0, 10.0, "s")),
-    # Probability that a reading is lost: the one before stays.
-    "dropout": Setting(0.0, Limits(0.0, 0.99)),
-}
+def setting_of(row: Values) -> Setting:
+    """A setting from its row."""
+    limits = dict(row)
+    default = limits.pop("default", None)
+    coefficient = limits.pop("coefficient", "")
+    known = COEFFICIENTS[coefficient] if coefficient else Limits(**limits)
+    return Setting(default, known, coefficient)
+
+
+def _about(name: str, table: Values) -> About:
+    own = table.get("settings", {})
+    settings = {one: setting_of(row) for one, row in own.items()}
+    return About(
+        name=name,
+        frame=table["frame"],
+        components=tuple(table["components"]),
+        units=tuple(table["units"]),
+        settings=settings | SAMPLING,
+        top=tuple(table.get("top", ())),
+        normals=table.get("normals", 0),
+    )
+
+
+_TABLES = read_own_toml(__file__, "sensors")
+SAMPLING = {name: setting_of(row) for name, row in _TABLES.pop("sampling").items()}
+"""Settings of all sensors."""
+ABOUT = {name: _about(name, table) for name, table in _TABLES.items()}
+"""Of each sensor, and of the estimate."""
 
 
 class Source(Kept):
     """Base of sensors and of the estimate.
 
     Class attributes:
-        name: In the option `sensors`, and of the observation's array.
-        frame: Of the reading; so are `components` and `units`.
-        top: Upper bound of each component, unless `bounds` computes it.
+        about: Its name, frame, components, units, bounds and settings.
     """
 
-    name: ClassVar[str]
-    frame: ClassVar[str]
-    components: ClassVar[tuple[str, ...]]
-    units: ClassVar[tuple[str, ...]]
-    top: ClassVar[tuple[float, ...]]
+    about: ClassVar[About]
 
     @classmethod
     def bounds(cls, values: Values) -> Bounds:
         """Bounds of a reading with these settings."""
-        return tuple(-bound for bound in cls.top), cls.top
+        return tuple(-bound for bound in cls.about.top), cls.about.top
 
 
 class Sensor(Source):
@@ -86,17 +101,11 @@ class Sensor(Source):
 
     Inside, a flag follows each reading: 1 if it is new, 0 if it was held.
 
-    Class attributes:
-        settings: By name, without those of the sampling.
-        columns: Normal numbers that a reading takes; `draw` gets as many at a reset.
-
     Attributes:
         values: All settings.
         interval: Time between two readings, s.
     """
 
-    settings: ClassVar[dict[str, Setting]]
-    columns: ClassVar[int]
     arrays: ClassVar[tuple[str, ...]] = ("_held", "_readings")
     _held: Array = None
     """The last reading that was taken."""
@@ -109,20 +118,9 @@ class Sensor(Source):
         self.world = world
         self._low, self._high = map(np.array, self.bounds(values))
         # One number more than the sensor takes decides whether a reading is lost.
-        self._noise = world.random.noise(f"sensor {self.name}", self.columns + 1)
+        self._noise = world.random.noise(f"sensor {self.about.name}", self.about.normals + 1)
         dropout = values["dropout"]
         self._lost = round(NormalDist().inv_cdf(dropout), 12) if dropout else -math.inf
-
-    @classmethod
-    def checked(cls, given: Values) -> dict[str, Any]:
-        """Settings by name as plain values. Raises `InputError`."""
-        settings = cls.settings | SAMPLING
-        check_names(given, settings, f"sensors.{cls.name}")
-        values = {}
-        for name, value in given.items():
-            number = check(f"sensors.{cls.name}.{name}", settings[name].limits, value)
-            values[name] = list(number) if isinstance(number, tuple) else number
-        return values
 
     @classmethod
     def resolved(cls, given: Values, vehicle: "models.Vehicle", period: float) -> dict[str, Any]:
@@ -131,18 +129,18 @@ class Sensor(Source):
         With `every` and `lag`, control steps between readings and of the delay.
         """
         values = {}
-        for name, (value, _, coefficient) in (cls.settings | SAMPLING).items():
+        where = f"sensors.{cls.about.name}"
+        for name, (value, _, coefficient) in cls.about.settings.items():
             if coefficient:
                 own = vehicle.coefficients[coefficient]
                 value = value if own is None else own
             value = given.get(name, value)
             if coefficient and value is None:
                 raise InputError(
-                    f"sensors.{cls.name}: expected {name} here, or {coefficient} in the vehicle's "
+                    f"{where}: expected {name} here, or {coefficient} in the vehicle's "
                     "file, got none"
                 )
             values[name] = value
-        where = f"sensors.{cls.name}"
         values["every"], values["lag"] = sampling(where, values["rate"], values["delay"], period)
         return values
 
@@ -189,6 +187,17 @@ class Sensor(Source):
     def _read(self, normal: Array) -> Array:
         """A reading within the sensor's bounds."""
         return clip(self.measure(normal[..., :-1]), self._low, self._high)
+
+
+def checked_settings(sensor: str, settings: Mapping[str, Setting], given: Values) -> Values:
+    """Settings of a sensor by name as plain values. Raises `InputError`."""
+    where = f"sensors.{sensor}"
+    check_names(given, settings, where)
+    values = {}
+    for name, value in given.items():
+        number = check(f"{where}.{name}", settings[name].limits, value)
+        values[name] = list(number) if isinstance(number, tuple) else number
+    return values
 
 
 def sampling(where: str, rate: float | None, delay: float, period: float) -> tuple[int, int]:

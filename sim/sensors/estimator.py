@@ -9,7 +9,7 @@ from ...models.matrices import cross
 from ..elementary import atan2, exp, expm1, wrapped
 from ..rotations import advanced, between, to_world, world_z
 from ..state import Array, WorldState, chosen, clip, parts_of, stack
-from .base import FURTHEST, MAX_SPEED, UNIT, Sensor, Source
+from .base import ABOUT, Sensor, Source
 
 TIME = 1.0
 """Time constant of all corrections, s."""
@@ -32,12 +32,8 @@ class Estimator(Source):
         gravity: m/s².
     """
 
-    name = "estimate"
+    about = ABOUT["estimate"]
     arrays = _PARTS
-    frame = "world; body rates: body"
-    components = ("x", "y", "z", "vx", "vy", "vz", "qw", "qx", "qy", "qz", "wx", "wy", "wz")
-    units = ("m",) * 3 + ("m/s",) * 3 + ("1",) * 4 + ("rad/s",) * 3
-    top = (FURTHEST,) * 3 + (MAX_SPEED,) * 3 + (UNIT,) * 4 + (2 * MAX_SPEED,) * 3
 
     position: Array = None
     velocity: Array = None
@@ -67,8 +63,10 @@ class Estimator(Source):
         velocity = self.velocity + period * acceleration
         position, velocity = self._followed(position, velocity, sensors)
         self.quaternion = chosen(mask, turned, self.quaternion)
-        self.position = chosen(mask, clip(position, -FURTHEST, FURTHEST), self.position)
-        self.velocity = chosen(mask, clip(velocity, -MAX_SPEED, MAX_SPEED), self.velocity)
+        furthest = self.about.top[0]
+        fastest = self.about.top[3]
+        self.position = chosen(mask, clip(position, -furthest, furthest), self.position)
+        self.velocity = chosen(mask, clip(velocity, -fastest, fastest), self.velocity)
         self.body_rates = chosen(mask, rates, self.body_rates)
 
     def _correction(self, force: Array, sensors: Mapping[str, Sensor]) -> Array:

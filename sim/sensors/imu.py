@@ -7,10 +7,7 @@ from numpy.typing import NDArray
 
 from ..rotations import to_body
 from ..state import Array, chosen
-from .base import Bounds, Sensor, Values, coefficients
-
-GYRO_RANGE = math.radians(2000.0)  # rad/s: the largest setting of the BMI088
-ACCELEROMETER_RANGE = 24 * 9.80665  # m/s²: the same
+from .base import ABOUT, Bounds, Sensor, Values
 
 
 class Imu(Sensor):
@@ -22,23 +19,8 @@ class Imu(Sensor):
     of the control step, under the thrusts and the forces of the air of its last physics step.
     """
 
-    name = "imu"
+    about = ABOUT["imu"]
     arrays = (*Sensor.arrays, "_bias")
-    settings = coefficients(
-        "",
-        "gyro_noise",
-        "accelerometer_noise",
-        gyro_walk=0.0,
-        gyro_bias=0.0,
-        gyro_range=GYRO_RANGE,
-        accelerometer_walk=0.0,
-        accelerometer_bias=0.0,
-        accelerometer_range=ACCELEROMETER_RANGE,
-    )
-    columns = 12
-    frame = "body"
-    components = tuple(f"{what} {axis}" for what in ("gyro", "accelerometer") for axis in "xyz")
-    units = ("rad/s",) * 3 + ("m/s²",) * 3
 
     _bias: Array = None
 

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ..scenery import Scenery
-from ..snapshots import Arrays, Snapshot
+from ..snapshots import Arrays, Snapshot, joined
 from ..state import Array, ByName, chosen, filled, pushed, taken
 
 
@@ -79,7 +79,7 @@ class Instrument:
 
     def snapshot(self) -> Snapshot:
         """Copies by array."""
-        return {name: past.copy() for name, past in self._past.items()}
+        return joined(self._past)
 
     def restore(self, arrays: Arrays) -> None:
         """Put a snapshot back."""

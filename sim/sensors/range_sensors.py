@@ -12,7 +12,7 @@ from zlib import crc32
 import numpy as np
 
 from ...models.errors import InputError
-from ...models.fields import Choice, Limits, Rule, check, check_names
+from ...models.fields import Choice, check
 from ...models.files import read_own_toml
 from ...scenes import Layouts, Rays, returns
 from ...scenes.rays import MAX_PLACE, MAX_REACH
@@ -20,59 +20,35 @@ from ...scenes.returns import RANGES, ErrorModel, Reading
 from ..random import words_of
 from ..rotations import to_world
 from ..state import Array, ByName, clip
-from .base import SAMPLING, Values, sampling
+from .base import SAMPLING, Setting, Values, checked_settings, sampling, setting_of
 from .instruments import Instrument, Moment
 
-MODELS: Mapping[str, Mapping[str, Values]] = read_own_toml(__file__, "range_sensors")
+_TABLES = read_own_toml(__file__, "range_sensors")
+_SETTINGS = {name: setting_of(row) for name, row in _TABLES.pop("settings").items()}
+_SETTINGS |= {name: SAMPLING[name] for name in ("rate", "delay")}
+MODELS: Mapping[str, Mapping[str, Values]] = _TABLES
 """Settings by kind and model."""
-_COUNT = Limits(1, 1024, "rays", whole=True)
-_DEGREES = Limits(-180.0, 180.0, "degrees")
-_METRES = Limits(1e-3, 1e3, "m")
-_PART = Limits(0.0, 1.0)
-_RULES: Mapping[str, Rule] = {
-    "rows": _COUNT,
-    "columns": _COUNT,
-    "fov": Limits(1.0, 170.0, "degrees"),
-    "low": Limits(-90.0, 90.0, "degrees"),
-    "high": Limits(-90.0, 90.0, "degrees"),
-    "near": _METRES,
-    "reach": _METRES,
-    "noise": Limits(0.0, 10.0, "m"),
-    "share": _PART,
-    "growth": Limits(0.0, 1.0, "1/m"),
-    "dropout": _PART,
-    "edge_dropout": _PART,
-    "position": Limits(-10.0, 10.0, "m", count=3),
-    "pitch": _DEGREES,
-    "yaw": _DEGREES,
-    "rate": SAMPLING["rate"].limits,
-    "delay": SAMPLING["delay"].limits,
+_PATTERNS = {
+    "depth": ("rows", "columns", "fov"),
+    "lidar": ("rows", "columns", "low", "high"),
+    "tof": ("rows", "columns", "fov"),
 }
+"""Settings of the rays by kind."""
 _BEYOND = 1.001  # of its reach: rays end where nothing returns
-_DEFAULTS = {
-    "noise": 0.0, "share": 0.0, "growth": 0.0, "dropout": 0.0, "edge_dropout": 0.0,
-    "position": (0.0, 0.0, 0.0), "pitch": 0.0, "yaw": 0.0, "rate": None, "delay": 0.0,
-}  # fmt: skip
-_KINDS = {"depth": ("rows", "columns", "fov"), "lidar": ("rows", "columns", "low", "high")}
-_KINDS["tof"] = _KINDS["depth"]
 KINDS = RANGES
 """In this order they are observed."""
 
 
-def checked(kind: str, given: Values) -> dict[str, Any]:
+def checked(kind: str, given: Values) -> Values:
     """Settings of a sensor as plain values. Raises `InputError`."""
-    where = f"sensors.{kind}"
-    models = tuple(MODELS[kind])
-    model = check(f"{where}.model", Choice(models), given.get("model", models[0]))
-    pattern = () if "directions" in MODELS[kind][model] else _KINDS[kind]
-    names = [name for name in _RULES if name in (*pattern, *_DEFAULTS, "near", "reach")]
-    check_names(given, ["model", *names], where)
-    values = {"model": model}
-    for name in given:
-        if name != "model":
-            value = check(f"{where}.{name}", _RULES[name], given[name])
-            values[name] = list(value) if isinstance(value, tuple) else value
-    return values
+    models = Choice(tuple(MODELS[kind]))
+    model = check(f"sensors.{kind}.model", models, given.get("model", models.words[0]))
+    others = {name for pattern in _PATTERNS.values() for name in pattern}
+    if "directions" not in MODELS[kind][model]:
+        others -= set(_PATTERNS[kind])
+    settings = {"model": Setting(None, models)}
+    settings |= {name: one for name, one in _SETTINGS.items() if name not in others}
+    return checked_settings(kind, settings, {"model": model, **given})
 
 
 class RangeSensor(Instrument):
@@ -95,7 +71,8 @@ class RangeSensor(Instrument):
         `latest` steps besides. Other drones are balls of a radius, m. Raises `InputError`.
         """
         model = MODELS[kind][given["model"]]
-        values = {**_DEFAULTS, **model, **given}
+        defaults = {name: setting.default for name, setting in _SETTINGS.items()}
+        values = {**defaults, **model, **given}
         where = f"sensors.{kind}"
         most = values["max_rate"]
         if (values["rate"] or 0.0) > most:
@@ -221,8 +198,8 @@ def _rays_of(kind: str, values: Values) -> Rays:
         if values["low"] > values["high"]:
             got = f"{values['low']:g} and {values['high']:g}"
             raise InputError(f"sensors.lidar: expected low <= high, got {got} degrees")
-        return Rays.rings(*(values[name] for name in _KINDS[kind]))
-    return Rays.pinhole(*(values[name] for name in _KINDS[kind]))
+        return Rays.rings(*(values[name] for name in _PATTERNS[kind]))
+    return Rays.pinhole(*(values[name] for name in _PATTERNS[kind]))
 
 
 def _turn(yaw: float, pitch: float) -> np.ndarray:

@@ -1,32 +1,16 @@
 """Sensors with white noise alone: magnetometer, rangefinder, GPS, motion capture."""
 
-from typing import ClassVar
-
 import numpy as np
 
-from ...models.fields import Limits
 from ..rotations import advanced, to_body
 from ..state import Array, clip, stack
-from .base import FURTHEST, MAX_SPEED, UNIT, Bounds, Sensor, Setting, Values, coefficients
-
-FIELD = (1.287, 21.532, -43.231)
-"""Earth's magnetic field at Zurich (47.377° N, 8.542° E, 408 m) on 2025-01-01: east, north and up,
-µT. World Magnetic Model WMM2025, NOAA NCEI and British Geological Survey."""
+from .base import ABOUT, Bounds, Sensor, Values
 
 
 class Magnetometer(Sensor):
     """Earth's field in the body frame; white noise. Setting: the field in the world frame."""
 
-    name = "magnetometer"
-    columns = 3
-    settings: ClassVar = {
-        **coefficients("magnetometer_", "noise"),
-        "field": Setting(FIELD, Limits(-100.0, 100.0, "µT", count=3)),
-    }
-    frame = "body"
-    components = ("field x", "field y", "field z")
-    units = ("µT",) * 3
-    top = (1e3,) * 3  # far from any reading but for a wrong noise
+    about = ABOUT["magnetometer"]
 
     def measure(self, normal: Array) -> Array:
         field = np.array(self.values["field"]) + 0.0 * normal
@@ -39,12 +23,7 @@ class Rangefinder(Sensor):
     It reads its limit where there is nothing.
     """
 
-    name = "rangefinder"
-    columns = 1
-    settings = coefficients("range_", "noise", "limit")
-    frame = "body, along -z"
-    components = ("distance",)
-    units = ("m",)
+    about = ABOUT["rangefinder"]
 
     @classmethod
     def bounds(cls, values: Values) -> Bounds:
@@ -58,16 +37,11 @@ class Rangefinder(Sensor):
 class Gps(Sensor):
     """Position and velocity of the body's origin; white noise."""
 
-    name = "gps"
-    columns = 6
-    settings = coefficients("gps_", "noise", "vertical_noise", "velocity_noise")
-    frame = "world"
-    components = ("x", "y", "z", "vx", "vy", "vz")
-    units = ("m",) * 3 + ("m/s",) * 3
-    top = (FURTHEST,) * 3 + (MAX_SPEED,) * 3
+    about = ABOUT["gps"]
 
     def measure(self, normal: Array) -> Array:
-        level, vertical, speed = (self.values[name] for name in self.settings)
+        names = ("noise", "vertical_noise", "velocity_noise")
+        level, vertical, speed = (self.values[name] for name in names)
         sigma = np.array((level, level, vertical, speed, speed, speed))
         state = self.world.state
         exact = np.concat((state.position, state.velocity), axis=-1)
@@ -77,13 +51,7 @@ class Gps(Sensor):
 class MotionCapture(Sensor):
     """Position and attitude; white noise, of the attitude about the body's axes."""
 
-    name = "motion_capture"
-    columns = 6
-    settings = coefficients("mocap_", "noise", "angle_noise")
-    frame = "world; quaternion: body to world"
-    components = ("x", "y", "z", "qw", "qx", "qy", "qz")
-    units = ("m",) * 3 + ("1",) * 4
-    top = (FURTHEST,) * 3 + (UNIT,) * 4
+    about = ABOUT["motion_capture"]
 
     def measure(self, normal: Array) -> Array:
         state = self.world.state

@@ -230,7 +230,7 @@ def test_thrust_is_clipped() -> None:
         assert info["F3"] == thrust
 
 
-COMPLEX = ("continuous", [1j], r"expected an array .* of real numbers, got \[1j\]")
+COMPLEX = ("continuous", [1j], r"expected real numbers, got \[1j\]")
 
 
 @pytest.mark.parametrize(

@@ -43,8 +43,8 @@ def test_a_missing_or_wrong_action_is_one_sentence() -> None:
     with pytest.raises(InputError, match="actions: expected a dict with drone_0, drone_1, got"):
         env.step({"drone_0": np.zeros(1, np.float32)})
     wrong = {"drone_0": np.zeros(1, np.float32), "drone_1": "up"}
-    sentence = r"of drone_1: expected an array of shape \(1,\) of real numbers, got 'up'"
+    sentence = "action of drone_1: expected real numbers, got 'up'"
     with pytest.raises(InputError, match=sentence):
         env.step(wrong)
-    with pytest.raises(InputError, match=r"actions: expected finite numbers, got \[inf\]"):
+    with pytest.raises(InputError, match="action of drone_0: expected finite numbers, got"):
         env.step(dict.fromkeys(env.agents, np.full(1, 1e39)))

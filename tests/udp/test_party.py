@@ -58,7 +58,7 @@ class Swarm:
         links = []
         for i, rows in enumerate(shares):
             client = Client(hello(70 + i), self.layout, config, draw_session=lambda i=i: 80 + i)
-            links.append(AgentLink(i, ("127.0.0.1", 1000 + i), client, np.array(rows)))
+            links.append(AgentLink(("127.0.0.1", 1000 + i), client, np.array(rows)))
         self.rules = SeveralAgents(self.world, layout(2), 0.1, links, patience=PATIENCE)
         self.agents = [self.agent() for _ in shares]
         self.states: list[list[State]] = [[], []]
@@ -74,13 +74,14 @@ class Swarm:
         while moving:
             moving = self.rules.step(self.now)
             self.rules.answer(self.now)
-            for link, agent in zip(self.rules.links, self.agents, strict=True):
+            pairs = zip(self.rules.links, self.agents, strict=True)
+            for number, (link, agent) in enumerate(pairs):
                 for datagram in outgoing(link.client):
                     event = agent.receive(datagram, HERE, self.now)
                     if event and isinstance(event.message, State):
-                        self.states[link.number].append(event.message)
+                        self.states[number].append(event.message)
                     elif event:
-                        self.closed[link.number] = event.message.reason
+                        self.closed[number] = event.message.reason
                     moving = True
                 for datagram, _ in outgoing(agent):
                     self.rules.receive(link, datagram, self.now)

@@ -104,13 +104,10 @@ def test_wrong_actions_and_seeds_raise_and_nothing_has_happened() -> None:
         remote.reset(seed=1)
         sent = remote.statistics.counters["sent"]
         for action, sentence in [
-            (np.array([np.nan]), "action: expected finite numbers"),
-            (np.array([np.inf]), "action: expected finite numbers"),
-            (
-                np.zeros(2),
-                r"action: expected real numbers of shape \(1,\), got float64 of shape \(2,\)",
-            ),
-            (0.5, r"expected real numbers of shape \(1,\), got float64 of shape \(\)"),
+            (np.array([np.nan]), "actions: expected finite numbers"),
+            (np.array([np.inf]), "actions: expected finite numbers"),
+            (np.zeros(2), r"actions: expected shape \(1,\), got \(2,\)"),
+            (0.5, r"actions: expected shape \(1,\), got \(\)"),
         ]:
             with pytest.raises(ValueError, match=sentence):
                 remote.step(action)
@@ -124,7 +121,7 @@ def test_wrong_actions_and_seeds_raise_and_nothing_has_happened() -> None:
     with flying(action_type="discrete") as pair:
         pair.remote.reset()
         for action in (3, -1, 0.5, True):
-            with pytest.raises(ValueError, match="action: expected"):
+            with pytest.raises(ValueError, match=r"actions?: expected"):
                 pair.remote.step(action)
 
 

@@ -136,12 +136,12 @@ def test_steps_at_the_wrong_time() -> None:
 @pytest.mark.parametrize(
     ("actions", "sentence"),
     [
-        (np.zeros(4), r"actions: expected an array of shape \(4, 1\), got shape \(4,\)"),
-        (np.zeros((2, 1)), r"actions: expected an array of shape \(4, 1\), got shape \(2, 1\)"),
-        (0.0, r"actions: expected an array of shape \(4, 1\), got shape \(\)"),
-        ([[0.0], [0.0], [0.0], [np.nan]], "action: expected finite numbers"),
-        ([[0.0], [0.0], [np.inf], [0.0]], "action: expected finite numbers"),
-        ([[0.0], [0.0], [1e300], [0.0]], "action: expected finite numbers"),
+        (np.zeros(4), r"actions: expected shape \(4, 1\), got \(4,\)"),
+        (np.zeros((2, 1)), r"actions: expected shape \(4, 1\), got \(2, 1\)"),
+        (0.0, r"actions: expected shape \(4, 1\), got \(\)"),
+        ([[0.0], [0.0], [0.0], [np.nan]], "actions: expected finite numbers"),
+        ([[0.0], [0.0], [np.inf], [0.0]], "actions: expected finite numbers"),
+        ([[0.0], [0.0], [1e300], [0.0]], "actions: expected finite numbers"),
     ],
 )
 def test_wrong_actions_raise_and_nothing_has_happened(actions: Any, sentence: str) -> None:
@@ -159,7 +159,7 @@ def test_wrong_discrete_actions() -> None:
     with flying(1, 2, action_type="discrete") as (remote, _):
         remote.reset()
         for actions in ([0, 3], [-1, 0], [0.5, 1], [np.nan, 1]):
-            with pytest.raises(ValueError, match="action: expected"):
+            with pytest.raises(ValueError, match="actions: expected"):
                 remote.step(np.array(actions))
         remote.step(np.array([0, 2]))
 

@@ -62,8 +62,6 @@ Participation = Literal["coming", "ready", "flying", "waiting", "left"]
 class AgentLink:
     """One agent of a simulator."""
 
-    number: int
-    """From 0."""
     address: Address
     client: Client
     """The exchange with it, with its statistics."""

@@ -326,7 +326,7 @@ def _links(
             by_text=by_text,
             key=key,
         )
-        links.append(AgentLink(number, there, client, rows))
+        links.append(AgentLink(there, client, rows))
     return links
 
 
