@@ -28,6 +28,9 @@ REST = len(KINDS)
 HEADER = 3
 """Numbers before the heights of a height field."""
 ROWS = 16
+WAYS = slice(ROWS, ROWS + 3)
+"""Further rows of a table of solids that move: the way of each in a control step, m, which ends at
+its center."""
 LANES = 16
 """Rays of a packet."""
 
@@ -317,6 +320,22 @@ def _gap(kind: Array, table: Array, j: Array, point: Vector, radius: Array) -> A
     return _pick(kind == _PLANE, up, gap)
 
 
+def _gap_then(
+    kind: Array, table: Array, j: Array, point: Vector, left: Array, radius: Array
+) -> Array:
+    """As `_gap`, while a share of its way is left to the primitive. Above a radius it is a lower
+    bound until the end of the step, but at least the radius.
+
+    So a craft touches now if it is below its radius, and need not look again while it is not, less
+    the craft's own way.
+    """
+    along, across, up = _three(table, ROWS, j)
+    there = (point[0] + left * along, point[1] + left * across, point[2] + left * up)
+    gap = _gap(kind, table, j, there, table[_ROUNDING, j])
+    way = left * (abs(along) + abs(across) + abs(up))
+    return _most(_least(gap, radius), gap - way)
+
+
 def _gap_of_hfield(table: Array, j: Array, point: Vector) -> Array:
     """As `_gap`, exact up to the width of a cell; beyond it a lower bound."""
     along, across, up = _local(table, j, point)
@@ -377,12 +396,18 @@ def _edge(start: Vector, way: Vector) -> Array:
     return dot(near, near)
 
 
-def distances(kinds: Array, table: Array, points: Array) -> Array:
+def distances(
+    kinds: Array, table: Array, points: Array, left: Array = _ZERO, radius: Array = _ZERO
+) -> Array:
     """From points, (N, 3), to the nearest primitive of a table, m, (N,), by NumPy."""
     plain = kinds < _HFIELD
     solids = table[:, plain]
+    point = points.T[:, :, None]
     everything = slice(None)
-    gaps = _gap(kinds[plain], solids, everything, points.T[:, :, None], solids[_ROUNDING])
+    if len(table) > ROWS:
+        gaps = _gap_then(kinds[plain], solids, everything, point, left, radius)
+    else:
+        gaps = _gap(kinds[plain], solids, everything, point, solids[_ROUNDING])
     nearest: Array = gaps.min(axis=1, initial=np.inf)
     for j in np.flatnonzero(kinds == _HFIELD).tolist():
         nearest = _least(nearest, _gap_of_hfield(table, j, points.T))
@@ -408,6 +433,18 @@ def _nearest(kinds: Array, table: Array, point: Vector) -> Array:
     return nearest
 
 
+def _nearest_then(kinds: Array, table: Array, point: Vector, left: Array, radius: Array) -> Array:
+    """As `_nearest` and `_gap_then`. Height fields do not move."""
+    nearest = _BIG
+    for j in range(1, kinds.size):
+        kind = kinds[j]
+        if kind == _HFIELD:
+            nearest = _least(nearest, _gap_of_hfield(table, j, point))
+        elif kind < _HFIELD:
+            nearest = _least(nearest, _gap_then(kind, table, j, point, left, radius))
+    return nearest
+
+
 def _first(kinds: Array, table: Array, point: Vector, ray: Vector) -> Array:
     """Along a ray from a point to the first primitive but the ground, m; 1e30 if there is none."""
     found = _BIG
@@ -424,30 +461,54 @@ def first_by_numpy(kinds: Array, table: Array, point: Array, ray: Array) -> Arra
         return _first(kinds, table, point, ray)
 
 
-def _gaps(kinds: Array, tables: Array, which: Array, points: Array, due: Array, out: Array) -> None:
+def _gaps(
+    kinds: Array, tables: Array, which: Array, points: Array, due: Array, left: Array,
+    radius: Array, out: Array,
+) -> None:  # fmt: skip
     """Set `out`, (W, A), to the distances of points, (W, A, 3), where `due`, (W, A), is true.
 
     float32, m; of layouts as `_packets` has them.
     """
     for w in range(out.shape[0]):
+        kind, table = kinds[which[w]], tables[which[w]]
         for a in range(out.shape[1]):
             if due[w, a]:
                 point = (points[w, a, 0], points[w, a, 1], points[w, a, 2])
-                out[w, a] = _nearest(kinds[which[w]], tables[which[w]], point)
+                if tables.shape[1] > ROWS:
+                    out[w, a] = _nearest_then(kind, table, point, left, radius)
+                else:
+                    out[w, a] = _nearest(kind, table, point)
 
 
 def gaps_by_numpy(
-    kinds: Array, tables: Array, which: Array, points: Array, due: Array, out: Array
-) -> None:
+    kinds: Array, tables: Array, which: Array, points: Array, due: Array, left: Array,
+    radius: Array, out: Array,
+) -> None:  # fmt: skip
     """As `_gaps`."""
     for w in np.flatnonzero(due.any(axis=1)):
-        near = distances(kinds[which[w], 1:], tables[which[w], :, 1:], points[w])
+        layout = kinds[which[w], 1:], tables[which[w], :, 1:]
+        near = distances(*layout, points[w], left, radius)
         out[w] = np.where(due[w], np.minimum(near, _BIG), out[w])
 
 
 def _nearest_at(count: int, kinds: Numba, table: Numba, x: Array, y: Array, z: Array) -> Array:
     """As `_nearest`, by the addresses of the kinds and of the table of so many primitives."""
     return _nearest(_array(kinds, (count,)), _array(table, (ROWS, count)), (x, y, z))
+
+
+def _nearest_then_at(
+    count: int,
+    kinds: Numba,
+    table: Numba,
+    x: Array,
+    y: Array,
+    z: Array,
+    left: Array,
+    radius: Array,
+) -> Array:
+    """As `_nearest_then`, likewise."""
+    layout = _array(kinds, (count,)), _array(table, (WAYS.stop, count))
+    return _nearest_then(*layout, (x, y, z), left, radius)
 
 
 def _first_at(
@@ -625,6 +686,8 @@ class Compiled(NamedTuple):
     gaps: Function
     nearest: int
     """Address of `_nearest_at`, whose first three arguments have 64 bits."""
+    nearest_then: int
+    """Address of `_nearest_then_at`."""
     first: int
     """Address of `_first_at`."""
     owners: Numba
@@ -702,7 +765,7 @@ def compiled() -> Compiled | None:
     table, row, numbers = "f4[:,:,::1]", "i8[::1]", "f4[:,::1]"
     rays = ["int8[:,::1]", table, row, *[numbers] * 5, "u8[::1]", numbers, numbers]
     packets = maker.made(",".join(rays), _packets)
-    points = ["int8[:,::1]", table, row, table, "b1[:,::1]", numbers]
+    points = ["int8[:,::1]", table, row, table, "b1[:,::1]", "f4", "f4", numbers]
     gaps = maker.made(",".join(points), _gaps)
     maker.names["_array"] = vars(numba)["carray"]
     number = types.float32
@@ -713,5 +776,7 @@ def compiled() -> Compiled | None:
         kind = number(types.int64, pointer(types.int8), pointer(number), *[number] * count)
         return cfunc(kind, cache=True)(maker.own(function))
 
-    nearest, first = owners = by_address(_nearest_at, 3), by_address(_first_at, 6)
-    return Compiled(packets, gaps, nearest.address, first.address, owners)
+    nearest, then = by_address(_nearest_at, 3), by_address(_nearest_then_at, 5)
+    first = by_address(_first_at, 6)
+    owners = (nearest, then, first)
+    return Compiled(packets, gaps, nearest.address, then.address, first.address, owners)

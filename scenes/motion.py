@@ -3,6 +3,10 @@
 When it begins, all are in their places. A row of motions, (11,), has the velocity of a throw, m/s,
 and its start, s; then two vectors of an ellipse, m, and its rate, rad/s: a solid is away from its
 place by `(cos(rate * t) - 1) * first + sin(rate * t) * second`.
+
+Physics knows where they are at the ends of control steps of T s, and moves them straight between:
+off by at most 9.8 T² / 8 in a fall, by a (rate T)² / 8 on an ellipse with the half axis a, and by
+v T / 4 in the step in which a throw with the speed v begins.
 """
 
 import math

@@ -321,7 +321,7 @@ class Layouts(NamedTuple):
     kinds: NDArray[np.int8]
     """Shape (S, P)."""
     tables: NDArray[np.float32]
-    """Shape (S, 16, P)."""
+    """Shape (S, 16, P), or (S, 19, P) if some move."""
 
     @classmethod
     def of(cls, *scenes: Solids) -> Self:
@@ -344,11 +344,11 @@ class Layouts(NamedTuple):
         return layouts
 
     @classmethod
-    def empty(cls, count: int, most: int) -> Self:
+    def empty(cls, count: int, most: int, rows: int = kernels.ROWS) -> Self:
         """Layouts without solids, each with places for `most` of them."""
         kinds = np.zeros((count, most), np.int8)
-        layouts = cls(kinds, np.zeros((count, kernels.ROWS, most), np.float32))
-        layouts.tables[:] = _NOTHING
+        layouts = cls(kinds, np.zeros((count, rows, most), np.float32))
+        layouts.tables[:, : kernels.ROWS] = _NOTHING
         return layouts
 
     def put(self, number: int, *scenes: Solids) -> None:
@@ -357,10 +357,10 @@ class Layouts(NamedTuple):
         for one in scenes:
             last = first + len(one.columns)
             self.kinds[number, first:last] = one.columns
-            self.tables[number, :, first:last] = one.table
+            self.tables[number, : kernels.ROWS, first:last] = one.table
             first = last
         self.kinds[number, first:] = 0
-        self.tables[number, :, first:] = _NOTHING
+        self.tables[number, : kernels.ROWS, first:] = _NOTHING
 
 
 def _columns_of(grid: Array, half: Array) -> Array:

@@ -17,7 +17,7 @@ from .compile import Untraceable
 from .compile.tracer import call_outside
 from .random import SCENES, Draw, Random
 from .snapshots import Arrays, Kept, Snapshot
-from .state import FAR, Array, ByName, clip, is_traced, looked_up, parts_of
+from .state import FAR, Array, ByName, clip, is_traced, looked_up, parts_of, stack
 
 _FURTHEST = 1e5  # m: of a craft that is lost
 
@@ -66,7 +66,8 @@ class Scenery(Kept):
             most = self.most
             self._motions = np.zeros((worlds, most, len(REST)))
             self._places = np.zeros((worlds, most, 3))
-            self.layouts = Layouts.empty(worlds, len(self._always.columns) + most)
+            most += len(self._always.columns)
+            self.layouts = Layouts.empty(worlds, most, kernels.WAYS.stop)
             self.which = np.arange(worlds)
             self._lay(np.flatnonzero(self.seeds >= 0))
         self.rows: Array
@@ -142,15 +143,17 @@ class Scenery(Kept):
         self._point()
 
     def move(self, mask: Array, time: Array) -> None:
-        """Solids of the worlds of a mask, (W, A), go to where they are at times of their episodes,
-        s, (W,).
+        """Solids of the worlds of a mask, (W, A), go from where they are to where they are at times
+        of their episodes, s, (W,): straight ahead.
         """
         if not self.moves:
             return
         self._frozen = None
         rows = np.flatnonzero(mask[:, 0])
         centers = self._places[rows] + offsets(self._motions[rows], time[rows, None])
-        self.centers[rows] = centers.transpose(0, 2, 1)
+        centers = centers.transpose(0, 2, 1)
+        self.ways[rows] = centers - self.centers[rows]
+        self.centers[rows] = centers
 
     def restore(self, arrays: Arrays) -> None:
         """Put a snapshot back."""
@@ -175,11 +178,14 @@ class Scenery(Kept):
             self._frozen = Frozen(shared, layouts)
         return self._frozen
 
-    def distance(self, position: Array, due: Array = None) -> Array:
+    def distance(
+        self, position: Array, due: Array = None, left: float = 0.0, radius: float = 0.0
+    ) -> Array:
         """From positions, (W, A, 3), to the nearest solid, m, float32, (W, A): at most `FAR`.
 
         Only where `due`, bool, (W, A), is true, elsewhere 0, and then without a derivative; None
-        is all.
+        is all. While a share of their ways is `left` to solids that move, with a radius, as of
+        `kernels`.
         """
         code = kernels.compiled()
         near = _single(position)
@@ -189,11 +195,15 @@ class Scenery(Kept):
             near = _held(near)
         if is_traced(near):
             mask = near[..., 0] == near[..., 0] if due is None else due
+            if self.moves:
+                near = stack([*parts_of(near), left, radius])
+                return self._called("nearest_then", mask, near)
             return self._called("nearest", mask, near)
         found = np.zeros(near.shape[:-1], np.float32)
         mask = np.ones(found.shape, bool) if due is None else due
         run = code.gaps if code else kernels.gaps_by_numpy
-        run(*self.layouts, self.which, np.ascontiguousarray(near), mask, found)
+        points = np.ascontiguousarray(near)
+        run(*self.layouts, self.which, points, mask, np.float32(left), np.float32(radius), found)
         return clip(found, np.float32(-FAR), np.float32(FAR))
 
     def along(self, position: Array, direction: Array) -> Array:
@@ -257,9 +267,17 @@ class Scenery(Kept):
 
     @property
     def centers(self) -> Array:
-        """Centers of what stands in the layouts, views, (S, 3, P)."""
+        """Centers of what stands in the layouts, a view, (S, 3, P)."""
+        return self._rows(slice(3))
+
+    @property
+    def ways(self) -> Array:
+        """Its ways in the control step that ends there, m, a view, (S, 3, P)."""
+        return self._rows(kernels.WAYS)
+
+    def _rows(self, rows: slice) -> Array:
         first = len(self._always.columns)
-        return self.layouts.tables[:, :3, first : first + self.most]
+        return self.layouts.tables[:, rows, first : first + self.most]
 
     def _point(self) -> None:
         """Set `rows`, and the openings of given layouts."""

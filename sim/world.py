@@ -56,6 +56,8 @@ class Call:
     """Whether it forgets earlier contacts."""
     looks: bool
     """Whether it looks for contacts at its end."""
+    left: float
+    """Share of the control step after it."""
 
 
 class World(NotCopied):
@@ -131,35 +133,36 @@ class World(NotCopied):
         self.begin(mask, pose)
         self.place(mask)
 
-    def step(
-        self, thrust: Array, substeps: int, mask: Array | None = None, *, again: bool = False
-    ) -> None:
-        """Fly the worlds of the mask, None for all, for `substeps` physics steps.
+    def step(self, thrust: Array, substeps: int, mask: Array | None = None) -> None:
+        """Fly the worlds of the mask, None for all, for a control step of `substeps` physics steps.
 
-        Thrusts in N, shape (W, A, R). With `again`, the call continues a step with the same mask:
-        the state's `touching` keeps the contacts of that step. A bad state raises `PhysicsError`,
-        which names the worlds to be reset.
+        Thrusts in N, shape (W, A, R). A bad state raises `PhysicsError`, which names the worlds to
+        be reset.
         """
         self.command(thrust, mask)
-        for call in self.calls(substeps, again=again):
+        for call in self.calls(substeps, substeps):
             if call.pushes:
                 self.push(mask)
             self.fly(call, mask)
 
-    def calls(self, substeps: int, *, again: bool = False) -> list[Call]:
-        """The calls of `fly` in a step, as of `step`."""
+    def calls(self, substeps: int, held: int) -> list[Call]:
+        """The calls of `fly` in a control step, in which each thrust is held for `held` of its
+        physics steps.
+        """
         often = self._acts or (self.scenery and not self.is_apart)
-        at_once = 1 if often else self._check
+        at_once = 1 if often else min(self._check, held)
         calls = []
         for first in range(0, substeps, at_once):
             done = min(first + at_once, substeps)
+            commands = first % held == 0
             calls.append(
                 Call(
                     steps=done - first,
-                    commands=first == 0,
-                    pushes=first == 0 or self._acts,
-                    clears=first == 0 and not again,
-                    looks=done % self._check == 0 or done == substeps,
+                    commands=commands,
+                    pushes=commands or self._acts,
+                    clears=first == 0,
+                    looks=done % self._check == 0 or done % held == 0,
+                    left=1.0 - done / substeps,
                 )
             )
         return calls

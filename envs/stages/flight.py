@@ -39,13 +39,12 @@ class Flight(Stage):
 
     def step(self, record: Record) -> None:
         """One control step."""
-        for first in range(0, self.substeps, self.held):
-            self._ask(record)
-            self.world.step(record.thrust, self.held, record.flown, again=first > 0)
-
-    def _ask(self, record: Record) -> None:
-        for part in self.parts:
-            part.step(record)
+        for call in self.calls():
+            if call.commands:
+                self.control(record)
+            elif call.pushes:
+                self.push(record)
+            self.world.fly(call, record.flown)
 
     # ---- the same in parts: all but the physics is array code
 
@@ -55,7 +54,8 @@ class Flight(Stage):
 
     def control(self, record: Record) -> None:
         """What the physics flies under from now on."""
-        self._ask(record)
+        for part in self.parts:
+            part.step(record)
         self.world.command(record.thrust, record.flown)
         self.push(record)
 
@@ -69,9 +69,7 @@ class Flight(Stage):
 
     def calls(self) -> list[Call]:
         """Calls of the physics in a step."""
-        world = self.world
-        firsts = range(0, self.substeps, self.held)
-        return [call for first in firsts for call in world.calls(self.held, again=first > 0)]
+        return self.world.calls(self.substeps, self.held)
 
     def close(self) -> None:
         """Close the world."""

@@ -66,6 +66,8 @@ class MujocoWorld(World):
         super().__init__(vehicle, shape, effects, randomize, scenery)
         threads = 1 if num_worlds == 1 else num_threads
         model = self._flown_model(drones)
+        if scenery.moves:
+            self._check = 1  # physics step: they move in each
         if scenery.varies:  # the compiled trees of bounding boxes do not follow the geoms
             model = copy.copy(model)
             model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_MIDPHASE
@@ -155,11 +157,16 @@ class MujocoWorld(World):
         first = self._batch.model.geom(f"{NAME}0").id
         return slice(first, first + self.scenery.most)
 
-    def _follow(self, ids: Array) -> None:
-        """Move the geoms of some worlds to where their solids are."""
+    def _follow(self, ids: Array, left: float = 0.0) -> None:
+        """Move the geoms of some worlds to where their solids are, a share of their ways left.
+
+        That is at the end of a physics step, of which MuJoCo finds the contacts where the craft is
+        at its beginning. Contacts take the solids as at rest.
+        """
         if self.scenery.moves:
             places = self._batch.expand("geom_pos")[:, self._slots]
-            places[ids] = self.scenery.centers.transpose(0, 2, 1)[ids]
+            centers = self.scenery.centers - left * self.scenery.ways
+            places[ids] = centers.transpose(0, 2, 1)[ids]
 
     def take(self) -> None:
         """Set the state's arrays that the physics changes."""
@@ -228,8 +235,8 @@ class MujocoWorld(World):
             self._ctrl[some] = self.acting.reshape(self._ctrl.shape)[some] / self._newtons
             if self.wrench is not None:
                 self._applied[some] = self.wrench.reshape(self._applied.shape)[some]
+        self._follow(some, call.left)
         if call.clears:
-            self._follow(some)
             self._clear_contacts(some)
         try:
             self._batch.step(ids, nstep=call.steps)

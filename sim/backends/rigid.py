@@ -109,7 +109,7 @@ class RigidWorld(World):
         """As `World.place`."""
         if self.slack is not None:
             self.slack = chosen(mask, np.zeros_like(self.slack), self.slack)
-        self._look(mask, looks=True, clears=True)
+        self._look(mask)
 
     def fly(self, call: Call, mask: Array | None) -> None:
         """As `World.fly`."""
@@ -120,7 +120,7 @@ class RigidWorld(World):
             way = _ROUNDED * length(new[..., :3] - self.motion[..., :3])
             self.slack = chosen(mask, self._typed(self.slack - way), self.slack)
         self._show(chosen(mask, new, self.motion))
-        self._look(mask, looks=call.looks, clears=call.clears)
+        self._look(mask, looks=call.looks, clears=call.clears, left=call.left)
         if not call.looks:
             return
         bad = ~(abs(self.motion) < mujoco.mjMAXVAL).all(axis=-1)
@@ -185,14 +185,17 @@ class RigidWorld(World):
         state.velocity = now[..., 7:10]
         state.body_rates = now[..., 10:]
 
-    def _touches_solids(self, mask: Array | None) -> Array:
+    def _touches_solids(self, mask: Array | None, left: float) -> Array:
         """Which crafts of a mask touch what stands in their scene, bool, (W, A).
 
-        The distance is computed where the last one, less the way since then, leaves no room.
+        The distance is computed where the last one, less the way since then, leaves no room: that
+        of the craft, and those of solids while a share of them is left, which `Scenery.distance`
+        subtracts.
         """
         due = self.slack < _NEAR
         due = due if mask is None else due & mask
-        slack = self.scenery.distance(self.state.position, due) - self.vehicle.radius
+        radius = self.vehicle.radius
+        slack = self.scenery.distance(self.state.position, due, left, radius) - radius
         self.slack = np.where(due, self._typed(slack), self.slack)
         return due & (self.slack < 0)
 
@@ -205,13 +208,15 @@ class RigidWorld(World):
         colliding = self._hull.collides(parts_of(state.position))
         return [touching | colliding, colliding]
 
-    def _look(self, mask: Array | None, *, looks: bool, clears: bool) -> None:
+    def _look(
+        self, mask: Array | None, *, looks: bool = True, clears: bool = True, left: float = 0.0
+    ) -> None:
         """Set which crafts touch, those of a mask: with what was before, unless it `clears`."""
         touched = self._contacts() if looks else [self._nobody, self._nobody]
         if self.slack is not None:
             if clears and self.scenery.moves:
                 self.slack = chosen(mask, np.zeros_like(self.slack), self.slack)
-            touched[0] = touched[0] | self._touches_solids(mask)
+            touched[0] = touched[0] | self._touches_solids(mask, left)
         for name, new in zip(("touching", "colliding"), touched, strict=False):
             old = getattr(self.state, name)
             if old is not None:

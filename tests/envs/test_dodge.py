@@ -29,7 +29,7 @@ def test_who_waits_is_hit() -> None:
     metrics = loop.metrics
     assert (metrics["touched"] == 1).all()
     assert (metrics["success"] == 0).all()
-    assert (metrics["least_clearance"] < 0.01).all()
+    assert (metrics["least_clearance"] < 0.02).all()  # at the end of a step that touched
     assert (loop.steps > 20).all()  # nothing comes at once
     assert len(set(loop.world.scenery.seeds)) == 32
 

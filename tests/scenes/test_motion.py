@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from capture import lens_of
 from rotorgram.envs import Loop
+from rotorgram.envs.compiled import CompiledLoop, make_loop
 from rotorgram.envs.config import EnvConfig
 from rotorgram.models.cameras import chosen_views
 from rotorgram.models.errors import InputError
@@ -64,16 +65,16 @@ def test_every_ball_is_thrown_at_the_craft() -> None:
         assert (posts.min(axis=0) < 1.1).all()
 
 
-def loop_in(scene: str, backend: str, **options: Any) -> Loop:
+def loop_in(scene: str, backend: str, worlds: int = 2, **options: Any) -> Loop:
     """Hovers 2 m above the origin, at rest."""
     keywords: dict[str, Any] = {
         "vehicle": "hummingbird", "start_band": 0.0, "goal": (0.0, 0.0, 2.0), "flight_band": 30.0,
-        "control_period": PERIOD, "action": "velocity", "episode_length": 1000,
+        "control_period": PERIOD, "action": "velocity", "episode_length": 1000, "compiled": False,
     }  # fmt: skip
     config = EnvConfig.from_keywords(
-        "rotorgram/Hover-v0", scene=scene, backend=backend, compiled=False, **keywords, **options
+        "rotorgram/Hover-v0", scene=scene, backend=backend, **keywords | options
     )
-    loop = Loop(config, 2)
+    loop = make_loop(config, worlds)
     step(loop, begins=True)
     return loop
 
@@ -191,6 +192,42 @@ def test_a_snapshot_brings_them_back(backend: str) -> None:
         step(theirs)
         assert (ours.observations["lidar"] == theirs.observations["lidar"]).all()
         assert (ours.world.clearance() == theirs.world.clearance()).all()
+
+
+@BACKENDS
+def test_a_touch_within_a_step_has_the_same_bits_everywhere(backend: str) -> None:
+    """Balls of 0.1 m at 20 m/s are over the craft from 0.77 s to 0.8 s, and pass it in a step."""
+
+    def draw(draft: Draft) -> None:
+        draft.add("ground/floor", "plane", (9, 9, 1), (0, 0, 0), "")
+        x = draft.uniform(9.95, 9.98)
+        motion = along_ellipse((10.0, 0.0, 0.0), (0.0, 0.0, 0.0), math.pi)
+        draft.add("ball_0/ball", "sphere", (0.1, 0, 0), (x, 0, 2), "", motion=motion)
+
+    register("darts", SceneType(draw=draw, moves=True))
+    try:
+        options: dict[str, Any] = {"control_period": 0.1, "start_tilt": 0.0}
+        ours = loop_in("darts:new", backend, **options)
+        fast = loop_in("darts:new", backend, compiled=None, **options)
+        alone = loop_in("darts:new", backend, 1, compiled=None, **options)
+        kept = loop_in("darts:new", backend, compiled=None, **options)
+        assert isinstance(fast, CompiledLoop)
+        for number in range(1, 9):
+            for loop in (ours, fast, alone, kept):
+                step(loop)
+            assert (ours.world.clearance() > 0.0).all()
+            assert ours.terminated.tolist() == [number == 8] * 2
+            state = ours.snapshot()
+            for loop in (fast, kept):
+                found = loop.snapshot()
+                assert found.keys() == state.keys()
+                assert all(found[name].tobytes() == state[name].tobytes() for name in state)
+            for name, array in alone.snapshot().items():
+                assert array.ndim < 2 or array[0].tobytes() == state[name][0].tobytes()
+            kept.restore(state)
+        assert not fast.refusal
+    finally:
+        SCENES.pop("darts")
 
 
 def test_drones_see_each_other() -> None:

@@ -305,11 +305,13 @@ def test_a_touch_in_an_earlier_physics_step_counts() -> None:
     world = make_world(vehicle, 1)
     begin(world, position=(0.0, 0.0, vehicle.rest_height - 1e-3))
     full = np.full(4, 100.0)
-    world.step(full, 1)
-    assert world.state.touching
-    for _ in range(30):
-        world.step(full, 1, again=True)
-    assert world.state.touching
+    world.command(full, None)
+    calls = world.calls(31, 1)
+    for call in calls:
+        world.push(None)
+        world.fly(call, None)
+        assert world.state.touching
+    assert [call.left for call in calls[::10]] == pytest.approx([30 / 31, 20 / 31, 10 / 31, 0.0])
     world.step(full, 1)
     assert not world.state.touching
 

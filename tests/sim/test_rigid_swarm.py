@@ -182,7 +182,7 @@ def test_spheres_touch_at_two_radii_and_fly_on(name: str | None) -> None:
 
 
 def test_a_touch_is_told_of_all_looks_of_a_control_step() -> None:
-    """They pass each other within one step: `again` adds to what was seen before."""
+    """They pass each other within one step: later calls keep what was seen before."""
     vehicle = Vehicle.load(linear_drag=0.0)
     radius = vehicle.radius
     sides = np.array((-1.0, 1.0))
@@ -192,11 +192,13 @@ def test_a_touch_is_told_of_all_looks_of_a_control_step() -> None:
     position[..., 2] = 900.0
     velocity[0, :, 0] = -50 * radius * sides
     none = np.zeros((1, 2, 4))
-    for steps in ([20], [10, 10]):
+    for held in (20, 10):
         world = arrays(vehicle, 1, 2)
         begin(world, position=position, velocity=velocity, thrust=none)
-        for i, count in enumerate(steps):
-            world.step(none, count, again=i > 0)
+        world.command(none, None)
+        for call in world.calls(20, held):
+            world.push(None)
+            world.fly(call, None)
         found = world.state.position[0, 0, 0]
         assert found > 5 * radius
         frozen = np.zeros((1, 2), bool)

@@ -1,5 +1,7 @@
 """What stands around drones: distances, touch on `rigid`, contact on `mujoco`."""
 
+from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -8,7 +10,8 @@ import numpy as np
 import pytest
 from rotorgram.models import InputError
 from rotorgram.models.vehicle import Vehicle
-from rotorgram.scenes import SceneConfig, Solids, kernels
+from rotorgram.scenes import SCENES, Draft, SceneConfig, SceneType, Solids, kernels, register
+from rotorgram.scenes.motion import along_ellipse
 from rotorgram.sim import make_world
 from rotorgram.sim.scenery import FAR
 from worlds import begin
@@ -94,6 +97,86 @@ def test_a_post_is_not_flown_through(ball: Vehicle, backend: str) -> None:
         assert world.state.position[0, 0, 0] < x
 
 
+@pytest.fixture
+def dart() -> Iterator[SceneConfig]:
+    """A ball of 0.1 m at x = 10 cos(2 t) m and 2 m above the ground: at 20 m/s over the origin."""
+
+    def draw(draft: Draft) -> None:
+        draft.add("ground/floor", "plane", (9, 9, 1), (0, 0, 0), "")
+        motion = along_ellipse((10.0, 0.0, 0.0), (0.0, 0.0, 0.0), np.pi)
+        draft.add("ball_0/ball", "sphere", (0.1, 0, 0), (10, 0, 2), "", motion=motion)
+
+    register("dart", SceneType(draw=draw, moves=True))
+    yield SceneConfig.parse("dart:1")
+    SCENES.pop("dart")
+
+
+@BACKENDS
+@pytest.mark.parametrize(("start", "steps", "touches"), [(0.7, 20, 15), (0.75, 10, 5)])
+def test_a_fast_ball_touches_within_a_control_step(
+    ball: Vehicle, dart: SceneConfig, backend: str, start: float, steps: int, touches: int
+) -> None:
+    """Its center is within 0.25 m of the craft's from 0.773 s to 0.798 s."""
+    world: Any = make_world(ball, 1, backend, scene=dart)
+    begin(world, position=at(1, 2.0))
+    everybody = np.ones((1, 1), bool)
+    for time in (start, 0.8):
+        world.scenery.move(everybody, np.array([time]))
+        assert world.clearance()[0, 0] > 0.0  # neither at the beginning nor at the end
+    world.command(world.state.thrust, None)
+    touched = []
+    for call in world.calls(steps, steps):
+        world.push(None)
+        world.fly(call, None)
+        touched.append(bool(world.state.touching[0, 0]))
+    assert len(touched) == steps
+    assert ball.timestep == 0.005
+    assert touched.index(True) + 1 == touches
+    assert all(touched[touches:])
+    world.scenery.move(everybody, np.array([0.9]))
+    world.step(world.state.thrust, steps)
+    assert not world.state.touching.any()
+
+
+def test_no_touch_is_missed_and_few_distances_are_computed(
+    monkeypatch: pytest.MonkeyPatch, ball: Vehicle
+) -> None:
+    """Against the distances of all physics steps, between solids on straight lines."""
+    count, period, steps = 8, 0.04, 8
+    world: Any = make_world(ball, count, "rigid", scene=SceneConfig.parse("traffic:0-9"))
+    world.random.seed(np.ones((count, 1), bool), list(range(count)))
+    asked = []
+    distance = world.scenery.distance
+
+    def counted(position: Any, due: Any, *further: float) -> Any:
+        asked.append(due.mean())
+        return distance(position, due, *further)
+
+    monkeypatch.setattr(world.scenery, "distance", counted)
+    begin(world, position=at(count, 2.0))
+    solids = [Solids.of_layout(world.scenery.scene, seed) for seed in world.scenery.seeds]
+    asked.clear()
+    found = []
+    expected = []
+    for number in range(1, 201):
+        world.scenery.move(np.ones((count, 1), bool), np.full(count, number * period))
+        world.command(world.state.thrust, None)
+        ends = [[one.at(n * period).centers for one in solids] for n in (number - 1, number)]
+        for step, call in enumerate(world.calls(steps, steps), 1):
+            world.push(None)
+            world.state.touching = np.zeros((count, 1), bool)
+            world.fly(call, None)
+            found.append(world.state.touching[:, 0])
+            for one, first, last in zip(solids, *ends, strict=True):
+                now = replace(one, centers=first + (last - first) * step / steps)
+                expected.append(now.distance((0.0, 0.0, 2.0)) - RADIUS)
+    gap = np.reshape(expected, (-1, count))
+    sure = abs(gap) > 1e-3
+    assert (np.array(found) == (gap < 0))[sure].all()
+    assert 20 < (gap < 0).sum() < 0.1 * gap.size
+    assert 1 / steps <= np.mean(asked) < 2.5 / steps
+
+
 @BACKENDS
 def test_each_episode_of_each_world_has_a_layout_of_its_own(ball: Vehicle, backend: str) -> None:
     given = {name: SceneConfig.parse(f"forest:{name}") for name in ("new", "unseen", "2-4")}
@@ -157,9 +240,9 @@ def test_a_distance_is_looked_for_only_where_a_craft_may_have_come_near(
     asked = []
     distance = world.scenery.distance
 
-    def counted(position: Any, due: Any) -> Any:
+    def counted(position: Any, due: Any, *further: float) -> Any:
         asked.append(bool(due.any()))
-        return distance(position, due)
+        return distance(position, due, *further)
 
     monkeypatch.setattr(world.scenery, "distance", counted)
     begin(world, position=[[[0.0, 0.0, 10.0]]], velocity=[[[15.0, 0.0, 0.0]]])
