@@ -160,6 +160,7 @@ class CompiledLoop(Loop):
             self._undo(flew)
             raise
         refuse_unfit(record, self.config.env_id)
+        self._refuse_stuck()
 
 
 def _begin(loop: Loop, actions: Array) -> None:

@@ -27,7 +27,8 @@ from ..models.fields import (
 from ..models.files import read_toml
 from ..models.library import is_of_the_library, vehicle_words
 from ..scenes import SceneConfig
-from ..scenes.config import is_scene_file
+from ..scenes.config import is_scene_file, refuse_hidden
+from ..scenes.returns import RANGES
 from ..sim import EffectOptions, Randomization
 from ..sim.effects import NO_EFFECTS
 from . import registry
@@ -317,6 +318,7 @@ class EnvConfig:
 
         Raises `InputError`.
         """
+        from ..sim.scenery import solids_around
         from ..sim.world import check_world
 
         task = registry.task_type(self.env_id)
@@ -338,7 +340,11 @@ class EnvConfig:
                 raise InputError(f"{name}: expected none with several vehicles, got {used}")
         randomize = Randomization(self.randomize, None)
         settings = self.backend.settings
-        check_world(vehicle, self.backend.name, self.effects, randomize, settings)
+        _, hidden = solids_around(vehicle, whole.scene)
+        check_world(vehicle, self.backend.name, self.effects, randomize, settings, hidden)
+        for sensor in RANGES:
+            if sensor in self.sensors:
+                refuse_hidden(hidden, f"the sensor {sensor}")
         resolved = replace(
             whole, vehicle_hash=vehicle.hash, task_hash=source_hash(task, self.scene.type.draw)
         )

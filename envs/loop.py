@@ -15,7 +15,7 @@ from ..models.errors import InputError
 from ..sim import Array, PhysicsError, Randomization, World, make_world
 from ..sim.sensors.instruments import Moment
 from ..sim.snapshots import Arrays, Snapshot, joined, part_of
-from ..sim.state import ByName, is_traced, some
+from ..sim.state import ByName, found, is_traced, some
 from .autoreset import Content, Seeds, Told, checked_seeds
 from .config import EnvConfig
 from .pipeline import Pipeline
@@ -136,8 +136,35 @@ class Loop:
         active = record.active
         if some(active):
             record.run(active, pipeline.observe)
+        if record.begun is not None:
+            self._refuse_stuck()
         self._take()
         self._measure()
+
+    def stuck(self) -> Array:
+        """Drones whose start touches a solid that no seed has drawn, bool, (W, A)."""
+        record = self._record
+        scenery = self._world.scenery
+        if scenery.scene.is_seeded:
+            return record.unfit & False
+        position = record.state.position
+        radius = self.vehicle.radius
+        starts = record.state.touching & (record.steps == 0) & ~record.waiting
+        if scenery.hidden:
+            return starts & (position[..., 2] > radius)
+        return starts & (scenery.distance(position, starts) < radius)
+
+    def _refuse_stuck(self) -> None:
+        """Raise `InputError` for a start as of `stuck`; its world must be reset again."""
+        stuck = self.stuck()
+        if found(stuck):
+            self._record.wait(stuck.any(axis=1, keepdims=True))
+            place = self._record.state.position[stuck][0]
+            name = self._world.scenery.touched(place, self.vehicle.radius)
+            raise InputError(
+                f"start: expected one that touches nothing, got {place.round(3).tolist()}, which "
+                f"touches {name}: move one of them"
+            )
 
     def _move_solids(self, steps: Array) -> None:
         """Move solids to their places after so many control steps of each episode, (W, A)."""

@@ -297,7 +297,7 @@ class Machine:
         if self._loop.instruments:
             seen |= {_SEEN + name: values for name, values in self._loop.sight().items()}
         seen |= {name: getattr(record, name) for name in _ENDS}
-        return seen | {"wrong": record.unfit | self._loop.world.bad}
+        return seen | {"wrong": record.unfit | self._loop.world.bad | self._loop.stuck()}
 
     def _pushed(self) -> Named:
         """What physics flies under that is no array code."""

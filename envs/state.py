@@ -20,14 +20,23 @@ class State(WorldState):
     """Control steps of each episode, whole numbers, shape (W, A)."""
     time: Array
     """Time since the start of each episode, s, shape (W, A)."""
-    clearance: Array = FAR
-    """Distance from a sphere about each body's origin, of `Vehicle.radius`, to the nearest solid
-    but level ground, m, shape (W, A): below 0 within one, at most `FAR`."""
+    known_clearance: Array = FAR
+    """`clearance`; None where solids are hidden, as meshes are."""
     distance: Callable[[Array], Array]
     """From points, world frame, m, (W, n, 3), to the nearest solid but level ground of each world,
     m, (W, n): as `clearance`, without the sphere."""
     neighbours: NDArray[np.float64] | None = None
     """What each drone has heard of its neighbours, see `stages/radio.py`: shape (W, A, k, 7)."""
+
+    @property
+    def clearance(self) -> Array:
+        """Distance from a sphere about each body's origin, of `Vehicle.radius`, to the nearest
+        solid but level ground, m, shape (W, A): below 0 within one, at most `FAR`. Raises
+        `InputError` where solids are hidden.
+        """
+        if self.known_clearance is None:
+            self.distance(self.position)  # raises
+        return self.known_clearance
 
 
 def kept_state(state: WorldState, **others: Any) -> State:

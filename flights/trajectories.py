@@ -179,7 +179,7 @@ def mean_traversability(flights: Iterable[Trajectory]) -> float:
     found = []
     for flight in flights:
         with suppress(InputError):  # a scene's file, or the telemetry, is elsewhere
-            solids = Solids.of_layout(flight.scene, flight.scene.seed)
+            solids = Solids.of_scene(flight.scene).standing()
             half = np.array(getattr(flight.scene.values, "size", _SIZE)) / 2
             height = flight.pose[0, 2]
             radius = flight.spec.constant("radius", "traversability")

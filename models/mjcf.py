@@ -180,10 +180,10 @@ def _numbers(element: ElementTree.Element) -> int:
 
 
 def _whole(text: str) -> int:
-    """A whole number of a text; 0 of another text, which MuJoCo refuses."""
+    """The largest number of a text, rounded down; 0 of another text, which MuJoCo refuses."""
     try:
-        return int(text.strip())
-    except ValueError:
+        return int(max(map(float, text.split()), default=0.0))
+    except (ValueError, OverflowError):
         return 0
 
 

@@ -220,12 +220,12 @@ def craft_geoms(model: MjModel) -> Array:
     return geoms
 
 
-def can_touch(model: MjModel, geom: int, others: Array) -> bool:
-    """Whether a geom may collide with one of others, bool, (geoms,)."""
-    types = model.geom_contype
-    affinities = model.geom_conaffinity
-    pairs = (types[geom] & affinities[others]) | (affinities[geom] & types[others])
-    return bool(pairs.any())
+def can_touch(model: MjModel, others: Array) -> Array:
+    """Which geoms may collide with one of others, bool, (geoms,)."""
+    types = np.bitwise_or.reduce(model.geom_contype[others])
+    affinities = np.bitwise_or.reduce(model.geom_conaffinity[others])
+    pairs = (model.geom_contype & affinities) | (model.geom_conaffinity & types)
+    return np.asarray(pairs != 0)
 
 
 def body_axes(model: MjModel) -> Array:

@@ -4,7 +4,7 @@ from itertools import compress
 
 from mujoco import MjModel
 
-from ..scenes import SceneConfig, Solids
+from ..scenes import SceneConfig, Solids, parse_scene
 
 
 class MovingGeoms:
@@ -12,7 +12,8 @@ class MovingGeoms:
 
     def __init__(self, model: MjModel, scene: str | SceneConfig) -> None:
         self._model = model
-        self._solids = Solids.of_scene(scene)
+        chosen = parse_scene(scene)
+        self._solids = Solids.of_layout(chosen, chosen.seed)
         self._moves = self._solids.moves
         names = compress(self._solids.names, self._moves)
         self._geoms = [model.geom(name).id for name in names]

@@ -1,6 +1,5 @@
 """Add a scene to a vehicle's spec: what it lacks of ground, sky and light, and all around it."""
 
-from collections.abc import Sequence
 from pathlib import Path
 
 import mujoco
@@ -11,8 +10,8 @@ from ..models import QUAD_XML
 from ..models.mjcf import delete_obstacles, has_ground, read_spec
 from . import AIRPORT_XML, SCENE_XML
 from .config import SceneConfig, parse_scene
-from .looks import SKY, add_geoms, add_parts
-from .obstacles import OWN, Obstacle, obstacles_of, parts_of_obstacles
+from .looks import GROUP, SKY, add_geoms, add_hulls, add_parts
+from .obstacles import OWN, obstacles_of, parts_of_obstacles
 
 SCENE_PREFIX = "scene/"  # of all names that `add_scene` adds for the plain scene
 _NEAR = 0.25  # m: nearest distance that is drawn
@@ -48,7 +47,7 @@ def add_scene(spec: MjSpec, scene: str | SceneConfig = "plain") -> None:
         delete_obstacles(spec)
     _add_plain(spec)
     if chosen.is_file:
-        _add_obstacles(spec, obstacles_of(chosen.embedded().content))
+        _add_obstacles(spec, chosen.embedded().content)
     elif chosen.name == "airport":
         _add_airport(spec)
     elif chosen.is_seeded:
@@ -60,13 +59,15 @@ def add_scene(spec: MjSpec, scene: str | SceneConfig = "plain") -> None:
     spec.compiler.discardvisual = False
 
 
-def _add_obstacles(spec: MjSpec, obstacles: Sequence[Obstacle]) -> None:
+def _add_obstacles(spec: MjSpec, content: str) -> None:
     """Add the obstacles of a file, which collide with nothing. Level ground is there already."""
+    obstacles = obstacles_of(content)
     geoms = add_geoms(spec, OWN, parts_of_obstacles(obstacles))
-    for geom, one in zip(geoms, obstacles, strict=True):
+    for geom, one in zip(geoms, obstacles, strict=False):  # hulls are the last
         geom.rgba = (*one.color, 1.0)
         if one.is_ground:
             spec.delete(geom)
+    add_hulls(spec, content, contype=0, conaffinity=0, group=GROUP)
 
 
 def _add_plain(spec: MjSpec) -> None:

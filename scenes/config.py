@@ -1,7 +1,7 @@
 """Which scene surrounds the drones, and which of its layouts each episode has."""
 
 import re
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import field, replace
 from functools import cached_property
 from pathlib import Path
@@ -195,6 +195,13 @@ def parse_scene(text: Any) -> SceneConfig:
         raise InputError(f"scene: expected one, got {scene}")
     scene.check_most()
     return scene
+
+
+def refuse_hidden(names: Iterable[str], user: str) -> None:
+    """Raise `InputError` for the first name of solids that their user does not know."""
+    for name in names:
+        expected = f"no mesh and no obstacle that moves with {user}: mujoco alone has them"
+        raise InputError(f"scene: expected {expected}, got {name}")
 
 
 def _text_of(value: object) -> str:

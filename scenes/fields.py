@@ -87,8 +87,8 @@ def least_of(grid: Array | None) -> float:
     return 0.0 if grid is None else float(grid.min())
 
 
-class Heights:
-    """Rule of the heights of a field: rows of numbers, m."""
+class Rows:
+    """Rule of rows of numbers, m: heights of a field, vertices of a hull."""
 
     expected = f"2 or more rows of as many numbers from -1000 to 1000 m, {MAX_POINTS} at most"
 
@@ -96,11 +96,11 @@ class Heights:
         """As `fields.Rule`."""
         if isinstance(value, tuple) and not value:
             return ()
-        heights = np.array(value)
-        if heights.dtype.kind not in "if" or heights.ndim != 2 or not (abs(heights) <= 1e3).all():
+        rows = np.array(value)
+        if rows.dtype.kind not in "if" or rows.ndim != 2 or not (abs(rows) <= 1e3).all():
             raise ValueError
-        check_points(len(heights), heights.shape[1], "heights")
-        return tuple(map(tuple, heights.astype(float).tolist()))
+        check_points(len(rows), rows.shape[1], "heights")
+        return tuple(map(tuple, rows.astype(float).tolist()))
 
 
 def check_points(rows: int, columns: int, where: str) -> None:

@@ -2,24 +2,24 @@
 
 import base64
 import struct
+from dataclasses import replace
 from pathlib import Path
 
 import mujoco
 import numpy as np
-from mujoco import MjSpec, mjtGeom
+from mujoco import MjData, MjModel, MjsHField, MjSpec, mjtGeom
 
 from ..models.bundle import written
 from ..models.errors import InputError, one_line
 from ..models.files import read_toml
-from ..models.mjcf import check_sizes, switch_off_log_file
+from ..models.mjcf import MAX_BYTES, check_sizes, switch_off_log_file
 from .config import SceneConfig
 from .fields import check_points
 from .geoms import geoms_of
 from .kernels import KINDS
-from .obstacles import SIZES, Obstacle, obstacles_in, to_content
+from .obstacles import HULL, SIZES, Obstacle, obstacles_in, to_content
 from .solids import Solids
 
-_HELD = (*KINDS, "ellipsoid")
 _GREY = (0.5, 0.5, 0.5, 1.0)  # of a geom without a colour of its own
 
 
@@ -60,11 +60,8 @@ def _of_mjcf(path: Path) -> tuple[Obstacle, ...]:
     switch_off_log_file()
     try:
         spec = MjSpec.from_file(str(path))
-        for field in spec.hfields:
-            if field.file:
-                file = Path(field.file).name if spec.strippath else field.file
-                _check_picture(path.parent / spec.meshdir / file)
         _keep_solids(spec)
+        _check_assets(spec, path.parent.absolute() / spec.meshdir)
         model = spec.compile()
     except InputError:
         raise
@@ -74,33 +71,73 @@ def _of_mjcf(path: Path) -> tuple[Obstacle, ...]:
     if moves.any():
         name = model.geom(int(moves.argmax())).name or "one without a name"
         raise InputError(f"expected geoms that stand still, got {name}, which moves")
-    solids = Solids.of_model(model)
+    is_mesh = model.geom_type == mjtGeom.mjGEOM_MESH
+    primitives = _primitives(Solids.of_model(model, ~is_mesh))
+    data = MjData(model)
+    mujoco.mj_kinematics(model, data)
+    hulls = [_hull(model, data, geom) for geom in np.flatnonzero(is_mesh).tolist()]
+    geoms = np.argsort(is_mesh, kind="stable").tolist()
     labels = {geom.id: geom.classname.name for geom in spec.geoms}
-    rows = geoms_of(solids, len(solids))
     return tuple(
+        replace(
+            one,
+            color=tuple(model.geom_rgba[geom, :3].astype(float).round(4).tolist()),
+            label="" if labels[geom] == "main" else labels[geom],
+        )
+        for geom, one in zip(geoms, primitives + hulls, strict=True)
+    )
+
+
+def _primitives(solids: Solids) -> list[Obstacle]:
+    rows = geoms_of(solids, len(solids))
+    return [
         Obstacle(
             kind=KINDS[kind],
             size=tuple(rows["geom_size"][i, : SIZES[KINDS[kind]]].tolist()),
             position=tuple(solids.centers[i].tolist()),
             heights=() if solids.grids[i] is None else solids.grids[i].round(5),
             quaternion=tuple(rows["geom_quat"][i].tolist()),
-            color=tuple(model.geom_rgba[i, :3].astype(float).round(4).tolist()),
-            label="" if labels[i] == "main" else labels[i],
         )
         for i, kind in enumerate(solids.kinds.tolist())
-    )
+    ]
+
+
+def _hull(model: MjModel, data: MjData, geom: int) -> Obstacle:
+    """The convex hull of a mesh, as MuJoCo found it."""
+    mesh = model.geom_dataid[geom]
+    graph = model.mesh_graph[model.mesh_graphadr[mesh] :]
+    count = graph[0]
+    chosen = model.mesh_vertadr[mesh] + graph[2 + count : 2 + 2 * count]
+    turned = model.mesh_vert[chosen] @ data.geom_xmat[geom].reshape(3, 3).T
+    place = tuple(data.geom_xpos[geom].tolist())
+    return Obstacle(kind=HULL, vertices=turned.round(6).tolist(), position=place)
+
+
+def _check_assets(spec: MjSpec, folder: Path) -> None:
+    """Check the files of height fields and meshes, before MuJoCo reads them and no others. Raises
+    `InputError`.
+    """
+    total = 0
+    for asset in (*spec.hfields, *spec.meshes):
+        if not asset.file:
+            continue
+        path = folder / (Path(asset.file).name if spec.strippath else asset.file)
+        total += path.stat().st_size if path.is_file() else MAX_BYTES + 1
+        if total > MAX_BYTES:
+            expected = f"files beside the scene's, of at most {MAX_BYTES} bytes in all"
+            raise InputError(f"expected {expected}, got {path.name}")
+        if isinstance(asset, MjsHField):
+            _check_picture(path)
+        asset.file = str(path)
+    spec.strippath = False
 
 
 def _check_picture(path: Path) -> None:
-    """Refuse heights of another file than a small PNG, before MuJoCo reads it. Raises
-    `InputError`.
-    """
-    header = b""
-    if path.is_file():
-        with path.open("rb") as file:
-            header = file.read(24)
+    """Refuse heights of another file than a small PNG. Raises `InputError`."""
+    with path.open("rb") as file:
+        header = file.read(24)
     if header[12:16] != b"IHDR":
-        raise InputError(f"expected heights from a PNG beside the scene's file, got {path.name}")
+        raise InputError(f"expected heights from a PNG, got {path.name}")
     columns, rows = struct.unpack(">II", header[16:])
     check_points(rows, columns, path.name)
 
@@ -108,10 +145,10 @@ def _check_picture(path: Path) -> None:
 def _keep_solids(spec: MjSpec) -> None:
     """Delete all of a spec but geoms that can touch, and give these the colour of their material.
 
-    Raises `InputError` for what no backend holds as a primitive.
+    Raises `InputError` for a flex or a plugin.
     """
-    if spec.flexes:
-        raise InputError(f"expected geoms, got the flex {spec.flexes[0].name}")
+    for part in (*spec.flexes, *spec.plugins):
+        raise InputError(f"expected geoms alone, got the flex or plugin {part.name}")
     for part in (*spec.pairs, *spec.tendons, *spec.sensors, *spec.actuators, *spec.equalities):
         spec.delete(part)
     spec.compiler.boundmass = spec.compiler.boundinertia = 1.0  # of bodies that lose their geoms
@@ -119,13 +156,11 @@ def _keep_solids(spec: MjSpec) -> None:
         if not geom.contype | geom.conaffinity:
             spec.delete(geom)
             continue
-        shape = mjtGeom(geom.type).name.removeprefix("mjGEOM_").lower()
-        if shape not in _HELD or geom.meshname:
-            expected = ", ".join(_HELD)
-            raise InputError(f"expected {expected}, got {geom.name or 'a geom'}, a {shape}")
         material = spec.material(geom.material) if geom.material else None
         if material is not None and np.allclose(geom.rgba, _GREY):
             geom.rgba = material.rgba
         geom.material = ""
-    for part in (*spec.materials, *spec.textures, *spec.meshes, *spec.skins):
+    used = {geom.meshname for geom in spec.geoms}
+    unused = [mesh for mesh in spec.meshes if mesh.name not in used]
+    for part in (*spec.materials, *spec.textures, *unused, *spec.skins):
         spec.delete(part)

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from ..models.mjcf import add_ground
 from . import kernels
 from .fields import least_of
-from .looks import GEOM_TYPES, shape_of
+from .looks import GEOM_TYPES, add_hulls, shape_of
 from .solids import Solids
 
 NAME = "rotorgram/solid"
@@ -19,8 +19,10 @@ _TURNED = (0.8, 0.0, 0.0, 0.6)
 _AWAY = (0.0, 0.0, -1e4)  # m: where geoms lie that stand for nothing
 
 
-def add_solids(spec: MjSpec, solids: Solids, count: int) -> None:
-    """Add solids to a spec as so many geoms, and level ground unless it has ground."""
+def add_solids(spec: MjSpec, solids: Solids, count: int, content: str) -> None:
+    """Add solids to a spec as so many geoms, the hulls of the content of a scene's file, and level
+    ground unless it has ground.
+    """
     add_ground(spec)
     own = MjSpec()  # its defaults are not the spec's
     fields = geoms_of(solids, count)
@@ -31,6 +33,7 @@ def add_solids(spec: MjSpec, solids: Solids, count: int) -> None:
             name=f"{number}", type=fields["geom_type"][number], pos=fields["geom_pos"][number],
             quat=fields["geom_quat"][number], **shape,
         )  # fmt: skip
+    add_hulls(own, content)
     own.visual, own.stat = spec.visual, spec.stat  # MuJoCo warns if they differ
     spec.attach(own, prefix=NAME, frame=spec.worldbody.add_frame())
 

@@ -15,6 +15,7 @@ from .config import SceneConfig
 from .fields import least_of
 from .generators import Parts, parts_of
 from .kernels import KINDS
+from .obstacles import hulls_of
 
 Array = NDArray[np.float64]
 
@@ -68,6 +69,16 @@ def add_geoms(spec: MjSpec, scene: str, parts: Parts) -> list[MjsGeom]:
         )  # fmt: skip
         geoms.append(geom)
     return geoms
+
+
+def add_hulls(spec: MjSpec, content: str, **settings: int) -> None:
+    """Add the hulls of the content of a scene's file to a spec, as geoms with further settings."""
+    for name, one in hulls_of(content).items():
+        spec.add_mesh(name=name, uservert=np.ravel(one.vertices))
+        spec.worldbody.add_geom(
+            name=name, type=mjtGeom.mjGEOM_MESH, meshname=name, pos=one.position,
+            quat=one.attitude, rgba=(*one.color, 1.0), **settings,
+        )  # fmt: skip
 
 
 def shape_of(spec: MjSpec, name: str, size: Vector, grid: Array | None) -> dict[str, object]:

@@ -18,12 +18,12 @@ from ..models.errors import InputError, shortened
 from ..models.fields import Limits, check
 from . import kernels
 from .build import HIDDEN_GROUP, add_scene, is_ground
-from .config import SceneConfig, parse_scene
+from .config import SceneConfig, parse_scene, refuse_hidden
 from .fields import centered, check_points
 from .generators import Draft, Parts, drafted, parts_of
 from .looks import HALL_XML
 from .motion import REST, offsets
-from .obstacles import OWN, Obstacle, obstacles_of, parts_of_obstacles
+from .obstacles import OWN, Obstacle, hulls_of, obstacles_of, parts_of_obstacles
 from .registry import MAX_SOLIDS
 
 Array = NDArray[np.float64]
@@ -67,12 +67,14 @@ class Solids:
 
     @classmethod
     def of_scene(cls, scene: str | SceneConfig) -> "Solids":
-        """All that pictures show of a single scene. Raises `InputError`."""
-        return _of_scene(parse_scene(scene).embedded())
+        """All that pictures show of a single scene. Raises `InputError`, for meshes too."""
+        whole = parse_scene(scene).embedded()
+        refuse_hidden(hulls_of(whole.content), "distances")
+        return _of_scene(whole)
 
     @classmethod
     def of_layout(cls, scene: SceneConfig, seed: int) -> "Solids":
-        """What stands in one layout of a scene, without level ground at z = 0."""
+        """What stands in one layout of a scene, without level ground at z = 0 and meshes."""
         if scene.is_seeded:
             return cls.of_drafts([drafted(scene, seed)])[0]
         return _made(scene, seed).standing()
@@ -112,7 +114,7 @@ class Solids:
 
     @classmethod
     def of_obstacles(cls, obstacles: Sequence[Obstacle]) -> Self:
-        """Those of a file."""
+        """Those of a file but hulls."""
         return cls.of_parts(parts_of_obstacles(obstacles), OWN)
 
     @classmethod

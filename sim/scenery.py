@@ -1,5 +1,6 @@
 """What stands around drones: the layout of each world, and distances to its solids."""
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -9,9 +10,10 @@ from numpy.typing import NDArray
 from ..models.errors import InputError
 from ..models.vehicle import Vehicle, can_touch, craft_geoms
 from ..scenes import SceneConfig, kernels
-from ..scenes.config import NEW_SEEDS
+from ..scenes.config import NEW_SEEDS, refuse_hidden
 from ..scenes.generators import drafted, openings_of
 from ..scenes.motion import REST, offsets
+from ..scenes.obstacles import hulls_of
 from ..scenes.solids import Layouts, Solids
 from .compile import Untraceable
 from .compile.tracer import call_outside
@@ -41,6 +43,7 @@ class Scenery(Kept):
         layouts: Solids of all layouts in use.
         which: Number of each world's layout, shape (W,).
         moves: Whether solids move.
+        hidden: Names as of `solids_around`.
         rows: As of `rows_of`; traced while code is compiled.
         openings: Of each world's layout, as of `generators.openings_of`, shape (W, K, 6); traced
             likewise.
@@ -48,9 +51,12 @@ class Scenery(Kept):
 
     arrays = ("seeds",)
 
-    def __init__(self, scene: SceneConfig, own: Solids, worlds: int) -> None:
+    def __init__(
+        self, scene: SceneConfig, own: Solids, worlds: int, hidden: Sequence[str] = ()
+    ) -> None:
         """`own`: what stands in every layout, of the vehicle's file."""
         self.scene = scene
+        self.hidden = hidden
         self.moves = scene.type.moves
         self._given = np.array([one.seed for one in scene.given_scenes], np.int64)
         self.seeds: Array = np.full(worlds, self._given[0] if self._given.size else -1, np.int64)
@@ -185,8 +191,9 @@ class Scenery(Kept):
 
         Only where `due`, bool, (W, A), is true, elsewhere 0, and then without a derivative; None
         is all. While a share of their ways is `left` to solids that move, with a radius, as of
-        `kernels`.
+        `kernels`. Raises `InputError` where solids are hidden.
         """
+        refuse_hidden(self.hidden, "a task that reads distances")
         code = kernels.compiled()
         near = _single(position)
         if not self:
@@ -205,6 +212,16 @@ class Scenery(Kept):
         points = np.ascontiguousarray(near)
         run(*self.layouts, self.which, points, mask, np.float32(left), np.float32(radius), found)
         return clip(found, np.float32(-FAR), np.float32(FAR))
+
+    def touched(self, position: Array, radius: float) -> str:
+        """Name of the first solid but the ground that a sphere touches in the first world."""
+        solids = self._always + self.solids(int(self.seeds[0]))
+        for number, name in enumerate(solids.names[1:], 1):
+            kinds = np.full_like(solids.columns, kernels.REST)
+            kinds[number] = solids.kinds[number]
+            if kernels.distances(kinds, solids.table, position[None]) <= radius:
+                return name
+        return next(iter(self.hidden), "a solid")
 
     def along(self, position: Array, direction: Array) -> Array:
         """From positions along unit vectors, (W, A, 3), to the first solid, as `distance`.
@@ -308,17 +325,19 @@ def _single(vectors: Array) -> Array:
     return clip(vectors, -_FURTHEST, _FURTHEST).astype(np.float32)
 
 
-def own_solids(vehicle: Vehicle, *, felt: bool) -> Solids:
-    """Obstacles of a vehicle's file. Those that touch is computed from, `felt`, have to be
-    primitives: others raise `InputError`. Otherwise meshes are left out.
+def solids_around(vehicle: Vehicle, scene: SceneConfig) -> tuple[Solids, Sequence[str]]:
+    """Obstacles of a vehicle's file, in place of which a scene's file stands.
+
+    And names of what collides on `mujoco` alone, for distances and rays do not know it: meshes of
+    either file, and obstacles of a vehicle's that move.
     """
+    if scene.is_file:
+        return Solids.none(), list(hulls_of(scene.embedded().content))
     model = vehicle.model
     ours = craft_geoms(model)
-    which = np.array([not ours[i] and can_touch(model, i, ours) for i in range(model.ngeom)])
-    moving = which & (model.body_weldid[model.geom_bodyid] != 0)
-    if felt and moving.any():
-        got = model.geom(int(moving.argmax())).name or "one that is moved"
-        raise InputError(f"vehicle: expected obstacles that stand still on rigid, got {got}")
-    if not felt:
-        which &= model.geom_type != mjtGeom.mjGEOM_MESH
-    return Solids.of_model(model, which).standing()
+    which = ~ours & can_touch(model, ours)
+    stands = model.body_weldid[model.geom_bodyid] == 0
+    known = which & stands & (model.geom_type != mjtGeom.mjGEOM_MESH)
+    hidden = np.flatnonzero(which & ~known).tolist()
+    names = [model.geom(i).name or f"geom {i} of the vehicle" for i in hidden]
+    return Solids.of_model(model, known).standing(), names

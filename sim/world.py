@@ -13,6 +13,7 @@ from ..models import Backend
 from ..models.errors import InputError, NotCopied
 from ..models.fields import immutable
 from ..scenes import SceneConfig
+from ..scenes.config import refuse_hidden
 from .compile.llvm import trouble
 from .effects import NO_EFFECTS, EffectOptions, Effects
 from .random import RANDOMIZATION, START, Draw, Random
@@ -217,7 +218,10 @@ class World(NotCopied):
     def clearance(self) -> Array:
         """Distance between a sphere of `Vehicle.radius` about each body's origin and the nearest
         solid but level ground, m, (W, A): at most `FAR`, and below 0 where it reaches into one.
+        None where solids are hidden.
         """
+        if self.scenery.hidden:
+            return None
         if not self.scenery:
             return self._nothing[..., 0] + FAR
         return self.scenery.distance(self.state.position) - self.vehicle.radius
@@ -320,8 +324,14 @@ def check_world(
     effects: EffectOptions,
     randomize: Randomization,
     settings: Mapping[str, Any],
+    hidden: Sequence[str],
 ) -> None:
-    """Refuse by name what the backend cannot honour. Raises `InputError`."""
+    """Refuse by name what the backend cannot honour. Raises `InputError`.
+
+    `hidden`: names as of `scenery.solids_around`.
+    """
+    if backend != "mujoco":
+        refuse_hidden(hidden, f"the backend {backend}")
     if getattr(vehicle, "members", ()):
         if backend != "mujoco":
             raise InputError(
@@ -357,7 +367,10 @@ def make_world(
     """
     if not (type(num_worlds) is int and 1 <= num_worlds <= MAX_WORLDS):
         raise InputError(f"num_envs: expected 1 to {MAX_WORLDS}, got {num_worlds!r}")
-    check_world(vehicle, backend, effects, randomize, settings)
+    from .scenery import Scenery, solids_around  # it imports MuJoCo
+
+    own, hidden = solids_around(vehicle, scene)
+    check_world(vehicle, backend, effects, randomize, settings, hidden)
     wanted = settings.pop("compiled", None)
     reason = "" if wanted is False else trouble()
     if wanted and reason:
@@ -367,13 +380,8 @@ def make_world(
     if backend == "rigid":
         settings["compiled"] = wanted is not False and not reason
     module = import_module(f".backends.{backend}", __package__)
-    from ..scenes import Solids  # they import MuJoCo
-    from .scenery import Scenery, own_solids
-
     cls = getattr(module, _CLASSES[backend])
-    # A scene's file stands in place of what the vehicle's has.
-    own = Solids.none() if scene.is_file else own_solids(vehicle, felt=not cls.is_apart)
-    scenery = Scenery(scene, own, num_worlds)
+    scenery = Scenery(scene, own, num_worlds, hidden)
     world: World = cls(
         vehicle, num_worlds, drones=drones, effects=effects, randomize=randomize,
         scenery=scenery, **settings,

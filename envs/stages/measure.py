@@ -36,7 +36,7 @@ class Measure(Stage):
             action=record.action,
             steps=steps,
             time=steps * self.period,
-            clearance=self.world.clearance(),
+            known_clearance=self.world.clearance(),
             distance=self.world.scenery.distance,
         )
         record.measured = record.state

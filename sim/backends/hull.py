@@ -88,9 +88,7 @@ def _shapes(model: mujoco.MjModel) -> list[tuple[Array, ...]]:
     shapes: list[tuple[Array, ...]] = []
     none = (0.0, 0.0, 0.0)
     kinds = mujoco.mjtGeom
-    for i in np.flatnonzero(ours).tolist():
-        if not can_touch(model, i, ~ours):
-            continue
+    for i in np.flatnonzero(ours & can_touch(model, ~ours)).tolist():
         place = data.geom_xpos[i].copy()
         axes = data.geom_xmat[i].reshape(3, 3).copy()
         a, b, c = model.geom_size[i].tolist()

@@ -126,7 +126,7 @@ class MujocoWorld(World):
         if scenery.scene.is_file:
             delete_obstacles(spec)
         fixed = Solids.none() if scenery.varies else scenery.solids(int(scenery.seeds[0]))
-        add_solids(spec, fixed, scenery.most)
+        add_solids(spec, fixed, scenery.most, scenery.scene.embedded().content)
         if not scenery.varies:
             return
         if not scenery.given and (scenery.solids(0).kinds == HFIELD).any():

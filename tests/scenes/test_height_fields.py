@@ -93,9 +93,10 @@ def test_rays_are_mujocos_and_numba_has_the_bits_of_numpy(
     code = kernels.compiled()
     assert code
     near = np.zeros((2, 1, 200), np.float32)
+    still = np.zeros(2, np.float32)
     both = Layouts.of(Solids.ground() + solids)
-    code.gaps(*both, np.zeros(1, np.int64), points, due, near[0])
-    kernels.gaps_by_numpy(*both, np.zeros(1, np.int64), points, due, near[1])
+    code.gaps(*both, np.zeros(1, np.int64), points, due, *still, near[0])
+    kernels.gaps_by_numpy(*both, np.zeros(1, np.int64), points, due, *still, near[1])
     assert near[0].tobytes() == near[1].tobytes()
     monkeypatch.setattr(kernels, "compiled", lambda: None)
     assert rays.cast(layouts, places, level).tobytes() == found.tobytes()

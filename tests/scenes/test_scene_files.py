@@ -199,7 +199,7 @@ def test_hostile_toml(tmp_path: Path, content: str | bytes, sentence: str) -> No
 
 MANY = "<replicate count='10000000' offset='1 0 0'><geom size='1'/></replicate>"
 NESTED = "<replicate count='1000'><replicate count='1000'><geom size='1'/></replicate></replicate>"
-MESH = "<asset><mesh name='m' vertex='0 0 0 1 0 0 0 1 0 0 0 1'/></asset>"
+CLOTH = "type='grid' count='3 3 1' dim='2' spacing='1 1 1'"
 FIELD = "<asset><hfield name='h' nrow='{0}' ncol='{0}' size='1 1 1 1'/></asset>"
 
 
@@ -210,8 +210,8 @@ FIELD = "<asset><hfield name='h' nrow='{0}' ncol='{0}' size='1 1 1 1'/></asset>"
         (f"<worldbody>{NESTED}</worldbody>", r"file: expected at most 10000 elements, got .*"),
         (FIELD.format(30_000), r"file: expected .* of at most .*"),
         (
-            MESH + "<worldbody><geom name='h' type='mesh' mesh='m'/></worldbody>",
-            r"expected sphere, .*, ellipsoid, got h, a mesh",
+            f"<worldbody><flexcomp name='f' {CLOTH}/></worldbody>",
+            r"expected geoms alone, got the flex or plugin f",
         ),
         (
             "<worldbody><body><joint/><geom name='door' size='1'/></body></worldbody>",

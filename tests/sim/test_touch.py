@@ -304,7 +304,7 @@ def test_obstacles_that_move_are_refused_by_name(tmp_path: Path) -> None:
     file.write_text(RACER.read_text().replace("</worldbody>", f"{lift}</worldbody>", 1))
     vehicle = Vehicle.load(file)
     make_world(vehicle, 1)
-    with pytest.raises(InputError, match=r"^vehicle: expected obstacles that stand still .* lift"):
+    with pytest.raises(InputError, match=r"^scene: expected .* the backend rigid: .*, got lift$"):
         make_world(vehicle, 1, "rigid")
 
 
