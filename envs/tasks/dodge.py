@@ -14,7 +14,7 @@ from .goal import Distance, Point, Tilt
 from .hover import Hover, HoverOptions
 from .task import Outcome
 
-_LIDAR = {"model": "os0", "rows": 8, "columns": 36, "low": -30.0, "high": 30.0}
+_LIDAR = {"model": "os0", "rows": 10, "columns": 48, "low": -30.0, "high": 45.0}
 _NEAR = 0.5  # cost of a step that touches; e times less each 0.5 m further off
 
 
@@ -28,7 +28,7 @@ class DodgeOptions(HoverOptions):
     """Largest distance of the start from the goal along each axis, m."""
     start_tilt: Tilt = 0.0
     """Largest tilt at the start, degrees, about a horizontal axis drawn uniformly."""
-    flight_band: Distance = 4.0
+    flight_band: Distance = 2.0
     """An episode terminates when the craft is further than this from its goal, m."""
 
 
@@ -39,7 +39,7 @@ class Dodge(Hover):
 
     `observation`, `float32`, shape (15 + R,): that of `Hover-v0`.
 
-    `lidar`, `float32`, shape (8, 36): distances in 8 rings from 30° below to 30° above, m. They
+    `lidar`, `float32`, shape (10, 48): distances in 10 rings from 30° below to 45° above, m. They
     tell where solids are, and not where they go: a policy has to compare them with the last ones.
 
     ## Action
@@ -48,18 +48,20 @@ class Dodge(Hover):
 
     ## Reward
 
-    That of `Hover-v0`, and -0.5 exp(-clearance / 0.5 m).
+    That of `Hover-v0` with s = 2 m, for a craft that moves aside should earn more than one that
+    crashes; and -0.5 exp(-clearance / 0.5 m).
 
     ## Start, termination, truncation
 
     At rest, level, within 0.3 m of the goal along each axis (`start_band`), before any ball flies.
     The scene is `traffic`, with a layout of its own in each episode.
 
-    *Terminated*: further than 4 m from the goal (`flight_band`), a tilt above 90°, or contact.
+    *Terminated*: further than 2 m from the goal (`flight_band`), a tilt above 90°, or contact.
     *Truncated*: after 300 steps of 0.04 s, when the last ball has passed.
     """
 
     Options = DodgeOptions
+    near = 2.0
     worst_step = Hover.worst_step - _NEAR
     action = "velocity"
     control_period = 0.04
@@ -83,7 +85,7 @@ class Dodge(Hover):
     def begin(self, mask: Array, draw: Draw) -> InitialState:
         """See the class."""
         start = super().begin(mask, draw)
-        self.memory.least = 0.0 * start.position[..., 0] + np.inf
+        self.memory.least = np.inf
         return start
 
     def update_memory(self, state: State) -> None:

@@ -37,9 +37,11 @@ class Gates(Racing):
     The track is that of the scene `gates`: a ring of eight gates whose places, heights and
     directions are drawn from a seed, another one in each episode. A touch ends the episode.
 
-    ## Observation, `float32`, shape (23 + R,)
+    ## Observation, `float32`, shape (22 + R,) or (23 + R,)
 
-    That of `Racing-v0`.
+    With the actions `rotors` and `rates` all numbers of `Racing-v0` in the body frame: one setting
+    serves every heading. The direction of world z takes the place of nose and thrust axis, and the
+    directions of gates have three numbers. With other actions, those of `Racing-v0`.
 
     ## Action
 
@@ -76,6 +78,7 @@ class Gates(Racing):
         if half <= self.vehicle.radius:
             expected = f"gates wider than the craft, {2 * self.vehicle.radius:.3g} m"
             raise InputError(f"opening: expected {expected}, got {2 * half:g} m")
+        self.body = self.action in ("rotors", "rates")
         reach = 2 * scale * _RING + 2 * self.options.margin
         self.define_race(_COUNT, reach, half)
 

@@ -19,6 +19,7 @@ from ...sim import (
 from ..spec import Metric
 from ..state import State
 from .goal import (
+    ERROR_SCALE,
     WORST_RATES,
     Distance,
     GoalTask,
@@ -87,6 +88,8 @@ class Hover(GoalTask):
     """
 
     Options = HoverOptions
+    near: ClassVar[float] = ERROR_SCALE
+    """Distance at which the reward for nearness crosses zero, m."""
     worst_step = -1.0 - HEADING_WEIGHT + WORST_RATES
     metrics: ClassVar[tuple[Metric, ...]] = (
         Metric(name="position_error", unit="m", settled=0.1, held=0.1, symbol="e"),
@@ -121,7 +124,7 @@ class Hover(GoalTask):
         heading = wrapped(off) * (180 / math.pi)
         crashed = self.crashed(state, distance > self.options.flight_band)
         terms = {
-            "position": nearness(distance),
+            "position": nearness(distance, self.near),
             "heading": -HEADING_WEIGHT / 180 * abs(heading),
         }
         metrics = {"position_error": distance, "heading_error": heading}

@@ -22,6 +22,7 @@ from ...sim import (
     remainder,
     sin,
     stack,
+    to_body,
     total,
 )
 from ..spec import Mark, Metric
@@ -168,9 +169,10 @@ class Racing(GoalTask):
         """Set `observation`, for gates of half a size and within a reach of each other, m."""
         self._count = count
         self._total = count * self.options.laps
-        numbers = along("direction of the gate", "1", 1.001, "xy")
+        axes = "xyz" if self.body else "xy"
+        numbers = along("direction of the gate", "1", 1.001, axes)
         numbers += along("gate after - position", "m", reach)
-        numbers += along("direction of the gate after", "1", 1.001, "xy")
+        numbers += along("direction of the gate after", "1", 1.001, axes)
         largest = half + 0.001
         numbers.append(Number("half size of the gate", "m", -largest, largest))
         self.define_observation(reach / 2, numbers)
@@ -239,7 +241,12 @@ class Racing(GoalTask):
         gate = self._gate(self.memory.passed)
         after = self._gate(self.memory.passed + 1.0)
         way = after[..., :3] - state.position
-        return gate[..., 3:5], way, after[..., 3:5], gate[..., 5]
+        vectors = [gate[..., 3:5], way, after[..., 3:5]]
+        if self.body:
+            level = 0.0 * way[..., :1]
+            vectors = [np.concat((vector, level), axis=-1)[..., :3] for vector in vectors]
+            vectors = [to_body(state.quaternion, vector) for vector in vectors]
+        return *vectors, gate[..., 5]
 
     def outcome(self, state: State) -> Outcome:
         """Progress to the next gate; the end at the last one, or off the track."""

@@ -8,8 +8,8 @@ from rotorgram.envs.config import EnvConfig
 DODGE = "rotorgram/Dodge-v0"
 
 
-def waits(scene: str | None, worlds: int) -> Loop:
-    """Flies back to the goal, whatever comes, until the end of each episode."""
+def waits(scene: str | None, worlds: int, aside: tuple[float, ...] = (0.0, 0.0, 0.0)) -> Loop:
+    """Flies back to the goal, or to a place aside, m, until the end of each episode."""
     options = {} if scene is None else {"scene": scene}
     loop = Loop(EnvConfig.from_keywords(DODGE, backend="rigid", **options), worlds)
     scale = loop.spec.action_scale
@@ -17,7 +17,7 @@ def waits(scene: str | None, worlds: int) -> Loop:
     ended = np.zeros(worlds, bool)
     for _ in range(300):
         to_goal = loop.observations["observation"][:, :3]
-        actions = np.column_stack((1.5 * to_goal, np.zeros(worlds))) / scale
+        actions = np.column_stack((1.5 * (to_goal + aside), np.zeros(worlds))) / scale
         loop.advance(np.clip(actions, -1, 1), None, None, ended)
         ended = ended | loop.done
     assert ended.all()
@@ -32,6 +32,13 @@ def test_who_waits_is_hit() -> None:
     assert (metrics["least_clearance"] < 0.02).all()  # at the end of a step that touched
     assert (loop.steps > 20).all()  # nothing comes at once
     assert len(set(loop.world.scenery.seeds)) == 32
+
+
+@pytest.mark.parametrize("aside", [(0.0, 0.0, 1.8), (1.8, 0.0, 0.0)])
+def test_no_place_in_the_band_is_safe(aside: tuple[float, ...]) -> None:
+    metrics = waits(None, 32, aside).metrics
+    assert metrics["touched"].sum() > 5
+    assert (metrics["touched"] + metrics["success"] == 1).all()
 
 
 def test_where_nothing_comes_it_succeeds() -> None:

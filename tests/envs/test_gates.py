@@ -46,6 +46,22 @@ def test_gates_are_passed_in_order_and_direction() -> None:
     assert left(task, 4.1, 0.0, 2.0) == 6
 
 
+@pytest.mark.parametrize(
+    ("action", "expected"),
+    [
+        ("rotors", [0, -1, 0, 0, -5, 0, 0, -1, 0, 0.75]),  # of a craft that looks to the left
+        ("velocity", [1, 0, 5, 0, 0, 1, 0, 0.75]),
+    ],
+)
+def test_gates_are_seen_in_the_frame_of_the_action(action: str, expected: list[float]) -> None:
+    task, _ = begun(action=action)
+    state = state_of(position=(-1.0, 0.0, 2.0), about=((0.0, 0.0, 1.0), 90.0))
+    seen = task.observe(state)["observation"]
+    to_goal = (0, -1, 0) if action == "rotors" else (1, 0, 0)
+    assert seen[:3] == pytest.approx(to_goal, abs=1e-12)
+    assert seen[-len(expected) :] == pytest.approx(expected, abs=1e-12)
+
+
 @pytest.mark.parametrize("seed", range(5))
 def test_openings_are_those_of_the_layout(seed: int) -> None:
     scene = SceneConfig.parse(f"gates:{seed},size=15x15")
