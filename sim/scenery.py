@@ -194,7 +194,6 @@ class Scenery(Kept):
         `kernels`. Raises `InputError` where solids are hidden.
         """
         refuse_hidden(self.hidden, "a task that reads distances")
-        code = kernels.compiled()
         near = _single(position)
         if not self:
             return np.zeros_like(near[..., 0]) + np.float32(FAR)
@@ -208,6 +207,7 @@ class Scenery(Kept):
             return self._called("nearest", mask, near)
         found = np.zeros(near.shape[:-1], np.float32)
         mask = np.ones(found.shape, bool) if due is None else due
+        code = kernels.compiled()
         run = code.gaps if code else kernels.gaps_by_numpy
         points = np.ascontiguousarray(near)
         run(*self.layouts, self.which, points, mask, np.float32(left), np.float32(radius), found)
