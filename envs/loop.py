@@ -159,7 +159,7 @@ class Loop:
         stuck = self.stuck()
         if found(stuck):
             self._record.wait(stuck.any(axis=1, keepdims=True))
-            place = self._record.state.position[stuck][0]
+            place = self._record.state.position[stuck][0].astype(float)
             name = self._world.scenery.touched(place, self.vehicle.radius)
             raise InputError(
                 f"start: expected one that touches nothing, got {place.round(3).tolist()}, which "

@@ -2,7 +2,9 @@
 
 import base64
 import struct
+from collections.abc import Iterator
 from dataclasses import replace
+from itertools import chain
 from pathlib import Path
 
 import mujoco
@@ -54,8 +56,8 @@ def path_of(scene: SceneConfig) -> str:
     return str(Path(written(((name, data),)).name, name))
 
 
-def _of_mjcf(path: Path) -> tuple[Obstacle, ...]:
-    """What stands still and can touch."""
+def _of_mjcf(path: Path) -> Iterator[Obstacle]:
+    """What stands still and can touch; the hulls of meshes are found one by one."""
     check_sizes(path, "file")
     switch_off_log_file()
     try:
@@ -75,16 +77,16 @@ def _of_mjcf(path: Path) -> tuple[Obstacle, ...]:
     primitives = _primitives(Solids.of_model(model, ~is_mesh))
     data = MjData(model)
     mujoco.mj_kinematics(model, data)
-    hulls = [_hull(model, data, geom) for geom in np.flatnonzero(is_mesh).tolist()]
+    hulls = (_hull(model, data, geom) for geom in np.flatnonzero(is_mesh).tolist())
     geoms = np.argsort(is_mesh, kind="stable").tolist()
     labels = {geom.id: geom.classname.name for geom in spec.geoms}
-    return tuple(
+    return (
         replace(
             one,
             color=tuple(model.geom_rgba[geom, :3].astype(float).round(4).tolist()),
             label="" if labels[geom] == "main" else labels[geom],
         )
-        for geom, one in zip(geoms, primitives + hulls, strict=True)
+        for geom, one in zip(geoms, chain(primitives, hulls), strict=True)
     )
 
 

@@ -112,19 +112,16 @@ class Obstacle:
 
 def to_content(obstacles: Iterable[Obstacle]) -> str:
     """Obstacles as the text of a TOML file. Raises `InputError` if it would be too long to read."""
-    lines = []
+    content = ""
     for one in obstacles:
-        lines.append("[[obstacle]]")
+        content += "[[obstacle]]\n"
         for field in fields(one):
             value = getattr(one, field.name)
             if value != field.default:
-                lines.append(f"{field.name} = {json.dumps(value)}")
-    content = "\n".join(lines) or "obstacle = []"
-    if len(content) > MAX_BYTES:
-        raise InputError(
-            f"obstacle: expected text of at most {MAX_BYTES} bytes, got {len(content)}"
-        )
-    return content
+                content += f"{field.name} = {json.dumps(value)}\n"
+        if len(content) > MAX_BYTES:
+            raise InputError(f"obstacle: expected text of at most {MAX_BYTES} bytes, got more")
+    return content.rstrip() or "obstacle = []"
 
 
 @lru_cache(maxsize=16)

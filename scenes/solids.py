@@ -96,11 +96,13 @@ class Solids:
     def of_parts(cls, parts: Parts, scene: str) -> Self:
         """What stands in a scene from a seed."""
         half = _halves(parts.kinds, parts.sizes)
-        furthest = abs(parts.positions).max(initial=0.0)
+        places = np.hstack((parts.positions, parts.axes[:, 0], parts.motions))
+        furthest = abs(places).max(initial=0.0)
         least, largest = half.min(initial=0.0), half.max(initial=0.0)
         if not (furthest <= _ENDLESS and least >= 0.0 and largest <= _ENDLESS):
             raise InputError(
-                f"scene: expected sizes and places within 1e6 m, got others in {scene}"
+                f"scene: expected sizes, places, headings and motions within 1e6, got others in "
+                f"{scene}"
             )
         return cls(
             label=lambda: tuple(f"{scene}/{name}" for name in parts.names()),

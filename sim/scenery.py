@@ -263,10 +263,10 @@ class Scenery(Kept):
         largest = max((len(one.columns) for one in made.values()), default=0)
         most = max(kinds.shape[1], len(self._always.columns) + largest)
         if kinds.shape != (count, most):
-            old = self.layouts
-            kinds, tables = self.layouts = Layouts.empty(count, most)
-            kinds[: len(old.kinds), : old.kinds.shape[1]] = old.kinds
-            tables[: len(old.kinds), :, : old.kinds.shape[1]] = old.tables
+            larger = Layouts.empty(count, most, tables.shape[1])
+            larger.kinds[: len(kinds), : kinds.shape[1]] = kinds
+            larger.tables[: len(kinds), :, : kinds.shape[1]] = tables
+            self.layouts = larger
             self.which = np.arange(count)
         for world, solids in made.items():
             self.layouts.put(world, self._always, solids)

@@ -243,8 +243,9 @@ def _ulog(path: Path) -> Columns:
     import pyulog  # for these files alone
 
     try:
-        log = pyulog.ULog(str(path))
-    except (TypeError, ValueError, LookupError) as error:
+        with path.open("rb") as file:
+            log = pyulog.ULog(file)
+    except (TypeError, ValueError, LookupError, pyulog.exceptions.ULogException) as error:
         raise InputError(f"log: expected a ULog file, got {path.name}: {error}") from None
     topics = {topic.name: topic.data for topic in reversed(log.data_list)}
     for topic in _TOPICS:

@@ -153,8 +153,8 @@ class MujocoWorld(World):
 
     @property
     def _slots(self) -> slice:
-        """Which geoms stand for solids of a layout."""
-        first = self._batch.model.geom(f"{NAME}0").id
+        """Which geoms stand for solids of a layout, where there are some."""
+        first = mujoco.mj_name2id(self._batch.model, mujoco.mjtObj.mjOBJ_GEOM, f"{NAME}0")
         return slice(first, first + self.scenery.most)
 
     def _follow(self, ids: Array, left: float = 0.0) -> None:

@@ -12,7 +12,7 @@ from zlib import crc32
 import numpy as np
 
 from ...models.errors import InputError
-from ...models.fields import Choice, check
+from ...models.fields import Choice, Limits, check
 from ...models.files import read_own_toml
 from ...scenes import Layouts, Rays, returns
 from ...scenes.rays import MAX_PLACE, MAX_REACH
@@ -98,7 +98,8 @@ class RangeSensor(Instrument):
                 f"got {self.errors.reach:g}"
             )
         self.shape = sensor.directions.shape[:2]
-        ends = np.minimum(_BEYOND * self.errors.reach / self._scale, MAX_REACH)
+        ends = _BEYOND * self.errors.reach / self._scale
+        check(f"{where}: its longest ray", Limits(0.0, MAX_REACH, "m"), float(ends.max()))
         self.rays = Rays(sensor.directions @ turn.T, ends.reshape(self.shape))
         grid = ("ring", "azimuth") if kind == "lidar" else ("row", "column")
         self.axes = () if "directions" in model else grid

@@ -41,7 +41,10 @@ def yard(folder: Path, *obstacles: str) -> str:
     return str(path)
 
 
-REFUSED = r"^start: expected one that touches nothing, got \[.*\], which touches own/ball_1/sphere:"
+PLACE = r"\[(-?\d+\.\d{1,3}(, )?){3}\]"
+REFUSED = (
+    rf"^start: expected one that touches nothing, got {PLACE}, which touches own/ball_1/sphere:"
+)
 
 
 @WAYS

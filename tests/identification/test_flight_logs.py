@@ -175,6 +175,15 @@ def ulog(path: Path) -> Path:
     return path
 
 
+def test_another_file_is_no_ulog_file(tmp_path: Path) -> None:
+    pytest.importorskip("pyulog")
+    path = tmp_path / "flight.ulg"
+    for content in (b"", bytes(4_000), b"t,x,y,z\n" * 500):
+        path.write_bytes(content)
+        with pytest.raises(InputError, match=r"^log: expected a ULog file, got flight.ulg: "):
+            read_log(path, LIVELY)
+
+
 def test_a_ulog_file_comes_in_our_frames(tmp_path: Path) -> None:
     pytest.importorskip("pyulog")
     log = read_log(ulog(tmp_path / "flight.ulg"), LIVELY)

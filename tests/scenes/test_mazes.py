@@ -230,9 +230,17 @@ def test_wrong_scenes_of_ones_own() -> None:
         draft.add("ball_0/ball", "sphere", (-1, 0, 0), (0, 0, 9), "")
         draft.add("ball_1/ball", "sphere", (1, 0, 0), (0, float("nan"), 9), "")
 
-    register("mine", SceneType(draw=wrong))
-    with pytest.raises(InputError, match=r"^scene: expected sizes and places .* others in mine"):
-        Solids.of_scene("mine:2")
+    def wrong_heading(draft: Draft) -> None:
+        draft.add("box_0/box", "box", (1, 1, 1), (0, 0, 9), "", heading=float("nan"))
+
+    def wrong_motion(draft: Draft) -> None:
+        draft.add("box_0/box", "box", (1, 1, 1), (0, 0, 9), "", motion=(float("nan"),) * 11)
+
+    for draw in (wrong, wrong_heading, wrong_motion):
+        register("mine", SceneType(draw=draw, moves=True))
+        words = r"^scene: expected sizes, places, headings and motions within 1e6, .* in mine"
+        with pytest.raises(InputError, match=words):
+            Solids.of_scene("mine:2")
     register("mine", SceneType(draw=too_many, options=Two))
     try:
         with pytest.raises(InputError, match=r"^scene: expected at most 2 parts of mine, got 3"):

@@ -2,6 +2,7 @@
 
 import json
 import struct
+import tracemalloc
 from contextlib import closing
 from pathlib import Path
 from typing import Any
@@ -236,6 +237,25 @@ def test_hostile_meshes(tmp_path: Path, asset: str, sentence: str) -> None:
     with pytest.raises(InputError, match=rf"^scene: {scene}: {sentence}") as caught:
         SceneConfig.parse(str(scene)).embedded()
     assert "\n" not in str(caught.value)
+
+
+def test_hulls_of_too_many_vertices_take_no_memory(tmp_path: Path) -> None:
+    """200 times a mesh of 1,000 vertices, which have some 30 kB as text."""
+    dice = np.random.default_rng(0).normal(size=(1_000, 3))
+    ball = dice / np.linalg.norm(dice, axis=1)[:, None]
+    lines = [f"v {x} {y} {z}" for x, y, z in ball.tolist()] + ["f 1 2 3", "f 1 2 4"]
+    (tmp_path / "round.obj").write_text("\n".join(lines))
+    geoms = "<worldbody><replicate count='200'><geom type='mesh' mesh='m'/></replicate></worldbody>"
+    asset = ASSET.format("file='round.obj'")
+    scene = tmp_path / "crowd.xml"
+    scene.write_text(f"<mujoco>{asset}{geoms}</mujoco>")
+    tracemalloc.start()
+    try:
+        with pytest.raises(InputError, match=r"expected text of at most 1000000 bytes, got more$"):
+            SceneConfig.parse(str(scene)).embedded()
+        assert tracemalloc.get_traced_memory()[1] < 8e6
+    finally:
+        tracemalloc.stop()
 
 
 @pytest.mark.parametrize(

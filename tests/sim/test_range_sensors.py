@@ -154,6 +154,10 @@ def test_every_model_says_where_its_numbers_come_from() -> None:
         ),
         ({"lidar": {"low": 9.0, "high": 3.0}}, "sensors.lidar: expected low <= high, got 9 and 3"),
         ({"tof": {"delay": 0.03}}, "sensors.tof.delay: expected a whole number of control"),
+        (
+            {"depth": {"fov": 170.0, "reach": 1000.0}},
+            "sensors.depth: its longest ray: expected a number from 0 to 10000 m, got 1",
+        ),
         ({"tof": 3}, "sensors.tof: expected true, or settings by name, got 3"),
     ],
 )

@@ -138,6 +138,47 @@ def test_a_fast_ball_touches_within_a_control_step(
     assert not world.state.touching.any()
 
 
+@BACKENDS
+@pytest.mark.parametrize("moves", [True, False])
+def test_a_scene_may_have_nothing_but_ground(ball: Vehicle, backend: str, moves: bool) -> None:
+    def draw(draft: Draft) -> None:
+        draft.add("ground/floor", "plane", (9, 9, 1), (0, 0, 0), "")
+
+    register("bare", SceneType(draw=draw, moves=moves))
+    try:
+        for text in ("bare:1", "bare:0-3", "bare:new"):
+            world: Any = make_world(ball, 2, backend, scene=SceneConfig.parse(text))
+            begin(world, position=at(2, 1.0))
+            world.scenery.move(np.ones((2, 1), bool), np.full(2, 0.5))
+            world.step(world.state.thrust, 2)
+            assert (world.scenery.distance(world.state.position) == FAR).all()
+            assert not world.state.touching.any()
+    finally:
+        SCENES.pop("bare")
+
+
+@BACKENDS
+def test_a_ball_moves_over_a_height_field(ball: Vehicle, backend: str) -> None:
+    """It has 0.1 m and is at x = 3 cos(2 t) m; the field is level, 2 m below both."""
+
+    def draw(draft: Draft) -> None:
+        draft.add("ground/floor", "plane", (9, 9, 1), (0, 0, 0), "")
+        draft.add_heights("sand_0/field", np.array((20.0, 20.0)), np.ones((9, 9)), 1.0, "")
+        motion = along_ellipse((3.0, 0.0, 0.0), (0.0, 0.0, 0.0), np.pi)
+        draft.add("ball_0/ball", "sphere", (0.1, 0, 0), (3, 0, 3), "", motion=motion)
+
+    register("sand", SceneType(draw=draw, moves=True))
+    try:
+        world: Any = make_world(ball, 2, backend, scene=SceneConfig.parse("sand:0-3"))
+        begin(world, position=at(2, 3.0))
+        assert world.scenery.distance(world.state.position) == pytest.approx(2.0, abs=1e-5)
+        time = np.arccos(1 / 3) / 2
+        world.scenery.move(np.ones((2, 1), bool), np.full(2, time))
+        assert world.scenery.distance(world.state.position) == pytest.approx(0.9, abs=1e-5)
+    finally:
+        SCENES.pop("sand")
+
+
 def test_no_touch_is_missed_and_few_distances_are_computed(
     monkeypatch: pytest.MonkeyPatch, ball: Vehicle
 ) -> None:

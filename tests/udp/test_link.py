@@ -452,6 +452,7 @@ def test_a_simulator_that_closes_before_its_first_state_is_answered(sealed: bool
     link.receive(reply, 0.0)
     assert link.state == "closed"
     assert not server.openings
+    assert server.statistics.last_error == "refused from 127.0.0.1:8000: bye"
 
 
 def test_a_state_0_is_not_answered() -> None:

@@ -313,6 +313,7 @@ class Server:
             opening.move("received", Close)
             goodbye = binary.encode(opening.goodbye(""))
             self.outbox.put([goodbye], arrival.address, opening.session_key())
+            self._drop("refused", message.reason, arrival)
         else:
             self._drop("foreign", type(message).__name__, arrival)
         return None
