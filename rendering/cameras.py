@@ -19,6 +19,7 @@ from ..models.mjcf import swarm_spec
 from ..models.swarm import drone_names
 from ..models.vehicle import Vehicle, owners
 from ..scenes import SceneConfig, add_scene
+from ..scenes.looks import PICTURED
 from ..scenes.marks import Mark
 from .gl import Offscreen
 from .moving import MovingGeoms
@@ -267,10 +268,7 @@ def own_discs(model: MjModel, camera: int) -> Array:
 def _add(body: MjsBody, name: str, kind: str, size: Sequence[float], **more: object) -> None:
     """A geom that is only drawn."""
     shape = getattr(mujoco.mjtGeom, f"mjGEOM_{kind.upper()}")
-    geom = body.add_geom(name=name, type=shape, size=size, **more)
-    geom.contype = geom.conaffinity = 0
-    geom.mass = 0.0
-    geom.group = 1
+    body.add_geom(name=name, type=shape, size=size, **PICTURED, **more)
 
 
 def _add_mark(body: MjsBody, name: str, mark: Mark, thickness: float) -> None:

@@ -86,9 +86,8 @@ def _refuse_forked() -> None:
 
 def columns(lines: Lines) -> tuple[str, str]:
     """The two columns of MuJoCo's overlay."""
-    names = "\n".join(name for name, _ in lines)
-    values = "\n".join(value for _, value in lines)
-    return names, values
+    names, values = zip(*lines, strict=True)
+    return "\n".join(names), "\n".join(values)
 
 
 class Offscreen:

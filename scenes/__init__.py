@@ -27,4 +27,6 @@ SCENE_XML = Path(__file__).parent / "scene.xml"
 """Ground, sky and light of the scene `plain`."""
 AIRPORT_XML = Path(__file__).parent / "airport.xml"
 """The airport."""
+HALL_XML = Path(__file__).parent / "hall.xml"
+"""Walls, windows, roof, lamps and racks of the warehouse."""
 __getattr__ = import_when_used(__name__)

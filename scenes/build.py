@@ -2,16 +2,16 @@
 
 from pathlib import Path
 
-import mujoco
-import numpy as np
 from mujoco import MjSpec
 
 from ..models import QUAD_XML
 from ..models.mjcf import delete_obstacles, has_ground, read_spec
 from . import AIRPORT_XML, SCENE_XML
 from .config import SceneConfig, parse_scene
-from .looks import GROUP, SKY, add_geoms, add_hulls, add_parts
-from .obstacles import OWN, obstacles_of, parts_of_obstacles
+from .geoms import add_geoms, add_hulls
+from .looks import PICTURED, SKY, add_parts
+from .obstacles import obstacles_of
+from .solids import Solids, is_ground
 
 SCENE_PREFIX = "scene/"  # of all names that `add_scene` adds for the plain scene
 _NEAR = 0.25  # m: nearest distance that is drawn
@@ -60,14 +60,17 @@ def add_scene(spec: MjSpec, scene: str | SceneConfig = "plain") -> None:
 
 
 def _add_obstacles(spec: MjSpec, content: str) -> None:
-    """Add the obstacles of a file, which collide with nothing. Level ground is there already."""
+    """Add the obstacles of a file, which collide with nothing. Level ground is there already, and
+    hides what reaches no higher.
+    """
     obstacles = obstacles_of(content)
-    geoms = add_geoms(spec, OWN, parts_of_obstacles(obstacles))
-    for geom, one in zip(geoms, obstacles, strict=False):  # hulls are the last
+    solids = Solids.of_obstacles(obstacles)
+    geoms = add_geoms(spec, solids, solids.names, PICTURED)
+    for geom, one, stands in zip(geoms, obstacles, solids.stands, strict=False):  # hulls are last
         geom.rgba = (*one.color, 1.0)
-        if one.is_ground:
+        if not stands:
             spec.delete(geom)
-    add_hulls(spec, content, contype=0, conaffinity=0, group=GROUP)
+    add_hulls(spec, content, PICTURED)
 
 
 def _add_plain(spec: MjSpec) -> None:
@@ -126,11 +129,3 @@ def _clear(spec: MjSpec, far: float, slices: int) -> None:
     visual.map.znear = _NEAR / model.stat.extent
     visual.map.zfar = far / model.stat.extent
     visual.quality.numslices = max(visual.quality.numslices, slices)
-
-
-def is_ground(model: mujoco.MjModel, geom: int) -> bool:
-    """Whether a geom is a plane of the world body at z = 0 that faces up."""
-    if model.geom_type[geom] != mujoco.mjtGeom.mjGEOM_PLANE or model.geom_bodyid[geom] != 0:
-        return False
-    is_level = np.abs(model.geom_quat[geom, 1:3]).max() < 1e-3
-    return bool(is_level and model.geom_pos[geom, 2] == 0.0)

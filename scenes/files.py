@@ -4,7 +4,6 @@ import base64
 import struct
 from collections.abc import Iterator
 from dataclasses import replace
-from itertools import chain
 from pathlib import Path
 
 import mujoco
@@ -77,22 +76,17 @@ def _of_mjcf(path: Path) -> Iterator[Obstacle]:
     primitives = _primitives(Solids.of_model(model, ~is_mesh))
     data = MjData(model)
     mujoco.mj_kinematics(model, data)
-    hulls = (_hull(model, data, geom) for geom in np.flatnonzero(is_mesh).tolist())
-    geoms = np.argsort(is_mesh, kind="stable").tolist()
-    labels = {geom.id: geom.classname.name for geom in spec.geoms}
-    return (
-        replace(
-            one,
-            color=tuple(model.geom_rgba[geom, :3].astype(float).round(4).tolist()),
-            label="" if labels[geom] == "main" else labels[geom],
-        )
-        for geom, one in zip(geoms, chain(primitives, hulls), strict=True)
-    )
+    for geom in sorted(spec.geoms, key=lambda one: one.id):
+        i = geom.id
+        one = _hull(model, data, i) if is_mesh[i] else next(primitives)
+        color = tuple(model.geom_rgba[i, :3].astype(float).round(4).tolist())
+        label = geom.classname.name
+        yield replace(one, color=color, label="" if label == "main" else label)
 
 
-def _primitives(solids: Solids) -> list[Obstacle]:
+def _primitives(solids: Solids) -> Iterator[Obstacle]:
     rows = geoms_of(solids, len(solids))
-    return [
+    return (
         Obstacle(
             kind=KINDS[kind],
             size=tuple(rows["geom_size"][i, : SIZES[KINDS[kind]]].tolist()),
@@ -101,7 +95,7 @@ def _primitives(solids: Solids) -> list[Obstacle]:
             quaternion=tuple(rows["geom_quat"][i].tolist()),
         )
         for i, kind in enumerate(solids.kinds.tolist())
-    ]
+    )
 
 
 def _hull(model: MjModel, data: MjData, geom: int) -> Obstacle:

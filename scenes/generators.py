@@ -6,7 +6,7 @@ World frame: z up, m. A generator draws what stands in a scene from one stream, 
 import math
 from collections.abc import Callable, Sequence
 from functools import lru_cache
-from typing import Annotated, Any, NamedTuple, Self
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike as Vector
@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 from ..models.errors import InputError
 from ..models.fields import Limits, immutable
 from ..models.files import read_own_toml
-from ..models.matrices import settled
 from .aisles import AislesOptions, aisles
 from .config import SceneConfig
 from .fields import HillsOptions, centered, hills
@@ -28,7 +27,7 @@ from .traffic import TrafficOptions, traffic
 
 Array = NDArray[np.float64]
 
-SPHERE, CAPSULE, CYLINDER, BOX, *_ = range(len(KINDS))
+SPHERE, CAPSULE, CYLINDER, BOX, _, HFIELD = range(len(KINDS))
 
 _MATERIALS = read_own_toml(__file__, "materials")
 """By scene and name."""
@@ -56,71 +55,16 @@ Vectors = Array | Sequence[Vector]
 """Three numbers, or arrays of them."""
 
 
-def _about_z(headings: Array) -> Array:
-    """Axes that are turned, (n, 3, 3)."""
-    axes = np.zeros((len(headings), 3, 3))
-    axes[:, 0, 0] = axes[:, 1, 1] = settled(np.cos(headings))
-    axes[:, 1, 0] = settled(np.sin(headings))
-    axes[:, 0, 1] = -axes[:, 1, 0]
-    axes[:, 2, 2] = 1.0
-    return axes
-
-
-class Parts(NamedTuple):
-    """Primitives, as geoms of MuJoCo."""
-
-    names: Names
-    kinds: NDArray[np.int8]
-    """Places in `kernels.KINDS`, shape (n,)."""
-    sizes: Array
-    """m, as MuJoCo has them, shape (n, 3)."""
-    positions: Array
-    """Of their centers, m, shape (n, 3)."""
-    materials: Names
-    axes: Array
-    """As columns, shape (n, 3, 3)."""
-    motions: Array
-    """As of `motion`, shape (n, 11)."""
-    grids: NDArray[np.object_]
-    """As of `Solids`, shape (n,)."""
-
-    @classmethod
-    def of(cls, drafts: "Sequence[Draft]") -> Self:
-        """Of one layout after the other."""
-        blocks = [block for draft in drafts for block in draft.blocks]
-        numbers = np.concatenate((np.empty((8, 0)), *[one.numbers for one in blocks]), axis=1)
-        count = numbers.shape[1]
-        motions = np.zeros((count, len(REST)))
-        grids = np.full(count, None)
-        first = 0
-        for one in blocks:
-            if one.motion is not REST:
-                motions[first] = one.motion
-            if one.grid is not None:
-                grids[first] = one.grid
-            first += one.numbers.shape[1]
-        return cls(
-            names=lambda: [name for one in blocks for name in one.names()],
-            kinds=numbers[0].astype(np.int8),
-            sizes=numbers[1:4].T,
-            positions=numbers[4:7].T,
-            materials=lambda: [name for one in blocks for name in one.materials()],
-            axes=_about_z(numbers[7]),
-            motions=motions,
-            grids=grids,
-        )
-
-
 class Block(NamedTuple):
     """Parts that were added together."""
 
     names: Names
     numbers: Array
-    """Kind, size, position and heading, (8, n)."""
+    """Kind, size as MuJoCo has it, m, position, m, and heading, rad, (8, n)."""
     materials: Names
-    motion: Sequence[float] = REST
+    motion: Sequence[float]
     """Of a single part."""
-    grid: Array | None = None
+    grid: Array | None
     """Likewise, as of `Solids`."""
 
 
@@ -178,8 +122,7 @@ class Draft:
     ) -> None:
         """Add a part that is turned about z, rad, and moves as of `motion`."""
         number = KINDS.index(kind)
-        self.add_all(lambda: [name], number, size, position, lambda: [material], heading)
-        self.blocks[-1] = self.blocks[-1]._replace(motion=motion)
+        self.add_all(lambda: [name], number, size, position, lambda: [material], heading, motion)
 
     def add_ground(self, material: str, edge: float = 150.0) -> None:
         """Add level ground, which pictures show up to so far from the origin, m."""
@@ -193,16 +136,22 @@ class Draft:
         positions: Vectors,
         materials: Names,
         headings: Vector = 0.0,
+        motion: Sequence[float] = REST,
+        grid: Array | None = None,
     ) -> None:
         """Add n parts. Sizes and positions are three numbers or arrays of n; a number is that of
-        all parts.
+        all parts. A motion or the grid of a height field is that of a single part. Raises
+        `InputError` for a motion in a scene that says that nothing moves.
         """
+        if motion is not REST and not self.scene.type.moves:
+            name = self.scene.name
+            raise InputError(f"scene: expected {name} to be registered with moves=True")
         rows = np.empty((8, np.size(positions[0])))
         rows[0] = kinds
         rows[1], rows[2], rows[3] = sizes
         rows[4], rows[5], rows[6] = positions
         rows[7] = headings
-        self.blocks.append(Block(names, rows, materials))
+        self.blocks.append(Block(names, rows, materials, motion, grid))
 
     def add_heights(
         self, name: str, half: Array, heights: Array, depth: float, material: str
@@ -211,8 +160,9 @@ class Draft:
         z = 0, m, (rows, columns), and how deep it is below it, m.
         """
         center, grid = centered(heights, depth)
-        self.add(name, "hfield", (*half, depth + center), (0, 0, center), material)
-        self.blocks[-1] = self.blocks[-1]._replace(grid=grid)
+        size = (*half, depth + center)
+        place = (0, 0, center)
+        self.add_all(lambda: [name], HFIELD, size, place, lambda: [material], grid=grid)
 
 
 @immutable
@@ -431,11 +381,6 @@ def _add_gate(track: Draft, number: int) -> None:
     for part, sign in (("top", 1), ("bottom", -1)):
         position = (x, y, height + sign * (half + bar))
         track.add(f"gate_{number}/frame_{part}", "box", (0.15, half, bar), position, tint, heading)
-
-
-def parts_of(scene: SceneConfig, seed: int) -> Parts:
-    """What stands in a scene, but for what its MJCF file has."""
-    return Parts.of([drafted(scene, seed)])
 
 
 def openings_of(scene: SceneConfig, seed: int) -> Array:

@@ -1,21 +1,26 @@
-"""What stands in a scene as geoms of MuJoCo, with which a craft collides."""
+"""What stands in a scene as geoms of MuJoCo, for contact and for pictures."""
+
+from collections.abc import Mapping, Sequence
 
 import mujoco
 import numpy as np
-from mujoco import MjModel, MjSpec, mjtGeom
-from numpy.typing import NDArray
+from mujoco import MjModel, MjsGeom, MjSpec, mjtGeom
+from numpy.typing import ArrayLike, NDArray
 
 from ..models.mjcf import add_ground
 from . import kernels
 from .fields import least_of
-from .looks import GEOM_TYPES, add_hulls, shape_of
-from .solids import Solids
+from .obstacles import hulls_of
+from .solids import Array, Solids
 
 NAME = "rotorgram/solid"
 """Of a geom, before its number."""
+GEOM_TYPES = [getattr(mjtGeom, f"mjGEOM_{kind.upper()}").value for kind in kernels.KINDS]
+"""MuJoCo's, by `kernels.KINDS`."""
 HFIELD = kernels.KINDS.index("hfield")
 # MuJoCo's compiler notes which geoms have the axes of their body, and turns these no more.
 _TURNED = (0.8, 0.0, 0.0, 0.6)
+_LEAST = 1e-6  # m: height and depth of a field, which MuJoCo wants above 0
 _AWAY = (0.0, 0.0, -1e4)  # m: where geoms lie that stand for nothing
 
 
@@ -25,59 +30,102 @@ def add_solids(spec: MjSpec, solids: Solids, count: int, content: str) -> None:
     """
     add_ground(spec)
     own = MjSpec()  # its defaults are not the spec's
-    fields = geoms_of(solids, count)
-    grids = [*solids.grids, *[None] * (count - len(solids))]
-    for number, grid in enumerate(grids):
-        shape = shape_of(own, f"{number}", fields["geom_size"][number], grid)
-        own.worldbody.add_geom(
-            name=f"{number}", type=fields["geom_type"][number], pos=fields["geom_pos"][number],
-            quat=fields["geom_quat"][number], **shape,
-        )  # fmt: skip
-    add_hulls(own, content)
+    add_geoms(own, solids, [f"{number}" for number in range(count)], {})
+    add_hulls(own, content, {})
     own.visual, own.stat = spec.visual, spec.stat  # MuJoCo warns if they differ
     spec.attach(own, prefix=NAME, frame=spec.worldbody.add_frame())
 
 
-def add_fields(spec: MjSpec, number: int, solids: Solids) -> None:
-    """Add the height fields of a layout to a spec."""
-    for row in np.flatnonzero(solids.kinds == HFIELD).tolist():
-        shape_of(spec, f"{NAME}{number}_{row}", solids.halves[row], solids.grids[row])
+def add_geoms(
+    spec: MjSpec, solids: Solids, names: Sequence[str], settings: Mapping[str, float]
+) -> list[MjsGeom]:
+    """Add solids to a spec as geoms with names and settings. Where there are more names, their
+    geoms stand for nothing.
+    """
+    fields = geoms_of(solids, len(names))
+    geoms = [
+        spec.worldbody.add_geom(
+            name=name, type=fields["geom_type"][number], pos=fields["geom_pos"][number],
+            quat=fields["geom_quat"][number], size=fields["geom_size"][number], **settings,
+        )
+        for number, name in enumerate(names)
+    ]  # fmt: skip
+    for row, name in add_fields(spec, solids, "").items():
+        geoms[row].hfieldname = name
+    return geoms
 
 
-def fields_of(model: MjModel, number: int, solids: Solids) -> NDArray[np.int64]:
-    """Which field of a model with `add_fields` each solid of a layout is, or -1, (n,)."""
-    which = np.full(len(solids), -1)
-    for row in np.flatnonzero(solids.kinds == HFIELD).tolist():
-        which[row] = model.hfield(f"{NAME}{number}_{row}").id
-    return which
+def add_hulls(spec: MjSpec, content: str, settings: Mapping[str, float]) -> None:
+    """Add the hulls of the content of a scene's file to a spec, as geoms with settings."""
+    for name, one in hulls_of(content).items():
+        spec.add_mesh(name=name, uservert=np.ravel(one.vertices))
+        spec.worldbody.add_geom(
+            name=name, type=mjtGeom.mjGEOM_MESH, meshname=name, pos=one.position,
+            quat=one.attitude, rgba=(*one.color, 1.0), **settings,
+        )  # fmt: skip
+
+
+def add_fields(spec: MjSpec, solids: Solids, layout: str) -> dict[int, str]:
+    """Add the height fields of a layout to a spec. Gives their names by the numbers of solids."""
+    names = _fields(solids, layout)
+    for row, name in names.items():
+        grid = solids.grids[row]
+        a, b, depth = solids.halves[row].tolist()
+        low = grid.min()
+        tall = max(grid.max() - low, _LEAST)
+        rows, columns = grid.shape
+        spec.add_hfield(
+            name=name, size=(a, b, tall, max(depth + low, _LEAST)), nrow=rows, ncol=columns,
+            userdata=((grid - low) / tall).ravel(),
+        )  # fmt: skip
+    return names
+
+
+def fields_of(
+    model: MjModel, solids: Solids, layout: str, count: int
+) -> dict[str, NDArray[np.int64]]:
+    """As `geoms_of`: which fields of a model with `add_fields` the geoms are, if any is one."""
+    names = _fields(solids, layout)
+    which = np.full(count, -1)
+    for row, name in names.items():
+        which[row] = model.hfield(name).id
+    return {"geom_dataid": which} if names else {}
+
+
+def _fields(solids: Solids, layout: str) -> dict[int, str]:
+    rows = np.flatnonzero(solids.kinds == HFIELD).tolist()
+    return {row: f"{NAME}{layout}_{row}" for row in rows}
 
 
 def geoms_of(solids: Solids, count: int) -> dict[str, np.ndarray]:
     """Fields of so many geoms of a model by name, the first of which are these solids."""
-    given = len(solids)
     kinds = solids.kinds
+    axes = solids.axes
     a, b, c = solids.halves.T
     lows = np.array([least_of(grid) for grid in solids.grids])
-    type_ = np.full(count, mjtGeom.mjGEOM_SPHERE.value)
-    type_[:given] = np.array([one.value for one in GEOM_TYPES])[kinds]
-    position = np.full((count, 3), _AWAY)
-    position[:given] = solids.centers + lows[:, None] * solids.axes[:, :, 2]
-    quaternion = np.tile(_TURNED, (count, 1))
-    for row, axes in zip(quaternion, solids.axes, strict=False):
-        mujoco.mju_mat2Quat(row, axes.ravel())
+    quaternions = np.empty((len(solids), 4))
+    for quaternion, turned in zip(quaternions, axes, strict=True):
+        mujoco.mju_mat2Quat(quaternion, turned.ravel())
     # What is chosen by kind is in the order of `kernels.KINDS`.
-    size = np.tile((0.1, 0.0, 0.0), (count, 1))
-    size[:given, 0] = np.choose(kinds, (a, a, a, a, 0.0, a))
-    size[:given, 1] = np.choose(kinds, (0.0, c - a, c, b, 0.0, b))
-    size[:given, 2] = np.choose(kinds, (0.0, 0.0, 0.0, c, 1.0, c))
+    first = np.choose(kinds, (a, a, a, a, 0.0, a))
+    second = np.choose(kinds, (0.0, c - a, c, b, 0.0, b))
+    third = np.choose(kinds, (0.0, 0.0, 0.0, c, 1.0, c))
     deep = c + abs(lows)
     furthest = np.sqrt(a * a + b * b + deep * deep)
-    reach = np.full(count, 0.1)
-    reach[:given] = np.choose(kinds, (c, c, np.sqrt(a * a + c * c), furthest, 0.0, furthest))
-    box = np.tile((0.0, 0.0, 0.0, 0.1, 0.1, 0.1), (count, 1))
-    box[:given, 2] = -lows
-    box[:given, 3:] = solids.halves
+    reach = np.choose(kinds, (c, c, np.sqrt(a * a + c * c), furthest, 0.0, furthest))
+    boxes = np.column_stack((0.0 * a, 0.0 * a, -lows, solids.halves))
+
+    def filled(given: Array, other: ArrayLike) -> np.ndarray:
+        """Numbers of the solids, and others of geoms that stand for nothing."""
+        rows = np.full((count, *np.shape(other)), other)
+        rows[: len(given)] = given
+        return rows
+
     return {
-        "geom_type": type_, "geom_pos": position, "geom_quat": quaternion, "geom_size": size,
-        "geom_rbound": reach, "geom_aabb": box,
-    }  # fmt: skip
+        "geom_type": filled(np.array(GEOM_TYPES)[kinds], GEOM_TYPES[0]),
+        "geom_pos": filled(solids.centers + lows[:, None] * axes[:, :, 2], _AWAY),
+        "geom_quat": filled(quaternions, _TURNED),
+        "geom_size": filled(np.column_stack((first, second, third)), (0.1, 0.0, 0.0)),
+        "geom_rbound": filled(reach, 0.1),
+        "geom_aabb": filled(boxes, (0.0, 0.0, 0.0, 0.1, 0.1, 0.1)),
+    }

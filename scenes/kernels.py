@@ -9,6 +9,7 @@ A table, shape (16, P), has of each primitive its center, its three axes, and ha
 box about it, m; the last row is the radius by which that box is rounded. Of a height field it is
 the number of columns to the first one with its heights, of the kind `REST`: how many it has along
 x and along y, the cosine of its steepest slope, and its heights above its center, m, row by row.
+A layout's has three further rows, `WAYS`.
 """
 
 from collections.abc import Callable
@@ -29,8 +30,8 @@ HEADER = 3
 """Numbers before the heights of a height field."""
 ROWS = 16
 WAYS = slice(ROWS, ROWS + 3)
-"""Further rows of a table of solids that move: the way of each in a control step, m, which ends at
-its center."""
+"""Further rows of a layout: the way of each in a control step, m, which ends at its center."""
+_WHOLE = WAYS.stop  # rows of a layout
 LANES = 16
 """Rays of a packet."""
 
@@ -404,7 +405,7 @@ def distances(
     solids = table[:, plain]
     point = points.T[:, :, None]
     everything = slice(None)
-    if len(table) > ROWS:
+    if left > _ZERO:
         gaps = _gap_then(kinds[plain], solids, everything, point, left, radius)
     else:
         gaps = _gap(kinds[plain], solids, everything, point, solids[_ROUNDING])
@@ -414,11 +415,11 @@ def distances(
     return nearest
 
 
-def _nearest(kinds: Array, table: Array, point: Vector) -> Array:
+def _nearest(kinds: Array, table: Array, point: Vector, left: Array, radius: Array) -> Array:
     """From a point to the nearest primitive of a layout but the first, the ground, m; 1e30 if there
-    is none.
+    is none. While ways are left, as `_gap_then`; height fields do not move.
     """
-    others = 0
+    others = _index(left > _ZERO)
     for j in range(1, kinds.size):
         others += kinds[j] >= _HFIELD
     nearest = _BIG
@@ -428,20 +429,10 @@ def _nearest(kinds: Array, table: Array, point: Vector) -> Array:
             nearest = _least(nearest, _gap(kind, table, j, point, table[_ROUNDING, j]))
         elif kind == _HFIELD:
             nearest = _least(nearest, _gap_of_hfield(table, j, point))
+        elif kind < _HFIELD and left > _ZERO:
+            nearest = _least(nearest, _gap_then(kind, table, j, point, left, radius))
         elif kind < _HFIELD:
             nearest = _least(nearest, _gap(kind, table, j, point, table[_ROUNDING, j]))
-    return nearest
-
-
-def _nearest_then(kinds: Array, table: Array, point: Vector, left: Array, radius: Array) -> Array:
-    """As `_nearest` and `_gap_then`. Height fields do not move."""
-    nearest = _BIG
-    for j in range(1, kinds.size):
-        kind = kinds[j]
-        if kind == _HFIELD:
-            nearest = _least(nearest, _gap_of_hfield(table, j, point))
-        elif kind < _HFIELD:
-            nearest = _least(nearest, _gap_then(kind, table, j, point, left, radius))
     return nearest
 
 
@@ -456,7 +447,7 @@ def _first(kinds: Array, table: Array, point: Vector, ray: Vector) -> Array:
 
 
 def first_by_numpy(kinds: Array, table: Array, point: Array, ray: Array) -> Array:
-    """As `_first`, of a point and a direction, (3,)."""
+    """As `_first`, of points and directions, (3, N)."""
     with np.errstate(all="ignore"):
         return _first(kinds, table, point, ray)
 
@@ -474,10 +465,7 @@ def _gaps(
         for a in range(out.shape[1]):
             if due[w, a]:
                 point = (points[w, a, 0], points[w, a, 1], points[w, a, 2])
-                if tables.shape[1] > ROWS:
-                    out[w, a] = _nearest_then(kind, table, point, left, radius)
-                else:
-                    out[w, a] = _nearest(kind, table, point)
+                out[w, a] = _nearest(kind, table, point, left, radius)
 
 
 def gaps_by_numpy(
@@ -491,12 +479,7 @@ def gaps_by_numpy(
         out[w] = np.where(due[w], np.minimum(near, _BIG), out[w])
 
 
-def _nearest_at(count: int, kinds: Numba, table: Numba, x: Array, y: Array, z: Array) -> Array:
-    """As `_nearest`, by the addresses of the kinds and of the table of so many primitives."""
-    return _nearest(_array(kinds, (count,)), _array(table, (ROWS, count)), (x, y, z))
-
-
-def _nearest_then_at(
+def _nearest_at(
     count: int,
     kinds: Numba,
     table: Numba,
@@ -506,9 +489,9 @@ def _nearest_then_at(
     left: Array,
     radius: Array,
 ) -> Array:
-    """As `_nearest_then`, likewise."""
-    layout = _array(kinds, (count,)), _array(table, (WAYS.stop, count))
-    return _nearest_then(*layout, (x, y, z), left, radius)
+    """As `_nearest`, by the addresses of the kinds and of the table of so many primitives."""
+    layout = _array(kinds, (count,)), _array(table, (_WHOLE, count))
+    return _nearest(*layout, (x, y, z), left, radius)
 
 
 def _first_at(
@@ -523,7 +506,7 @@ def _first_at(
     dz: Array,
 ) -> Array:
     """As `_first`, by such addresses."""
-    layout = _array(kinds, (count,)), _array(table, (ROWS, count))
+    layout = _array(kinds, (count,)), _array(table, (_WHOLE, count))
     return _first(*layout, (x, y, z), (dx, dy, dz))
 
 
@@ -540,7 +523,7 @@ def _packets(
     """Distances along rays of W sensors to the first primitive, m; to their ends if there is none.
 
     Args:
-        kinds, tables: Of layouts, (S, P) and (S, 16, P).
+        kinds, tables: Of layouts, (S, P) and (S, 19, P).
         which: Layout of each sensor, (W,).
         place: Of each sensor, m, (W, 3).
         attitude: From its frame to the world's: rows of matrices, (W, 9).
@@ -565,8 +548,7 @@ def _packets(
         found[:] = reach
         _ranges(table, place[w], furthest, far)
         if whole.shape[0]:
-            _turn(attitude[w], whole, bounds)
-            _hide(table, place[w], bounds, far)
+            _hide(table, place[w], attitude[w], whole, bounds, far)
         for j in range(kind.size):
             if far[j] > _MARGIN or kind[j] == REST:
                 continue
@@ -599,14 +581,12 @@ def _ranges(table: Array, place: Array, reach: Array, far: Array) -> None:
         far[j] = _gap(_BOX, table, j, (place[0], place[1], place[2]), _ZERO) - reach
 
 
-def _turn(m: Array, planes: Array, turned: Array) -> None:
-    """Set the normals of planes of a sensor to those in the world, by rows of its attitude."""
-    for f in range(planes.shape[0]):
-        turned[f, 0], turned[f, 1], turned[f, 2] = _along(planes[f], m[:3], m[3:6], m[6:])
-
-
-def _hide(table: Array, place: Array, bounds: Array, far: Array) -> None:
-    """Set it for what lies behind one of six planes about a place, with normals in the world."""
+def _hide(table: Array, place: Array, m: Array, planes: Array, bounds: Array, far: Array) -> None:
+    """Set it for what lies behind one of six planes of a sensor, by its place and the rows of its
+    attitude. `bounds` become the planes with normals in the world.
+    """
+    for f in range(6):
+        bounds[f, 0], bounds[f, 1], bounds[f, 2] = _along(planes[f], m[:3], m[3:6], m[6:])
     for j in range(far.size):
         x, y, z = _three(table, _CENTER, j)
         center = (x - place[0], y - place[1], z - place[2])
@@ -684,14 +664,10 @@ class Compiled(NamedTuple):
 
     packets: Function
     gaps: Function
-    nearest: int
-    """Address of `_nearest_at`, whose first three arguments have 64 bits."""
-    nearest_then: int
-    """Address of `_nearest_then_at`."""
-    first: int
-    """Address of `_first_at`."""
-    owners: Numba
-    """Of the code there."""
+    nearest: Numba
+    """C function `_nearest_at`, whose first three arguments have 64 bits."""
+    first: Numba
+    """C function `_first_at`."""
 
 
 def _one_instruction() -> Function:
@@ -758,25 +734,19 @@ def compiled() -> Compiled | None:
     except ImportError:
         return None
     import numba
-    from numba import cfunc, types
 
     for large in (_gap_of_hfield, _meet_hfield):  # inlined, they would slow the others
         maker.names[large.__name__] = maker.compile()(maker.own(large))
-    table, row, numbers = "f4[:,:,::1]", "i8[::1]", "f4[:,::1]"
-    rays = ["int8[:,::1]", table, row, *[numbers] * 5, "u8[::1]", numbers, numbers]
-    packets = maker.made(",".join(rays), _packets)
-    points = ["int8[:,::1]", table, row, table, "b1[:,::1]", "f4", "f4", numbers]
-    gaps = maker.made(",".join(points), _gaps)
+    layouts, rows = "int8[:,::1],f4[:,:,::1],i8[::1]", "f4[:,::1]"
+    rays = f"{rows},{rows},{rows},{rows},{rows},u8[::1],{rows}"
+    packets = maker.made(f"{layouts},{rays},{rows}", _packets)
+    gaps = maker.made(f"{layouts},f4[:,:,::1],b1[:,::1],f4,f4,{rows}", _gaps)
     maker.names["_array"] = vars(numba)["carray"]
-    number = types.float32
-    pointer: Numba = types.CPointer
 
     def by_address(function: Function, count: int) -> Numba:
         """A function of C of a layout and so many further numbers."""
-        kind = number(types.int64, pointer(types.int8), pointer(number), *[number] * count)
-        return cfunc(kind, cache=True)(maker.own(function))
+        numbers = ",f4" * count
+        kind = f"f4(i8,CPointer(i1),CPointer(f4){numbers})"
+        return vars(numba)["cfunc"](kind, cache=True)(maker.own(function))
 
-    nearest, then = by_address(_nearest_at, 3), by_address(_nearest_then_at, 5)
-    first = by_address(_first_at, 6)
-    owners = (nearest, then, first)
-    return Compiled(packets, gaps, nearest.address, then.address, first.address, owners)
+    return Compiled(packets, gaps, by_address(_nearest_at, 5), by_address(_first_at, 6))

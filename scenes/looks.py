@@ -2,32 +2,24 @@
 
 import math
 from collections.abc import Mapping
-from pathlib import Path
 from typing import Any
 
 import mujoco
 import numpy as np
-from mujoco import MjsGeom, MjSpec, mjtGeom
+from mujoco import MjSpec, mjtGeom
 from numpy.typing import ArrayLike as Vector
-from numpy.typing import NDArray
 
+from . import HALL_XML
 from .config import SceneConfig
-from .fields import least_of
-from .generators import Parts, parts_of
-from .kernels import KINDS
-from .obstacles import hulls_of
+from .generators import drafted
+from .geoms import add_geoms
+from .solids import Solids
 
-Array = NDArray[np.float64]
-
-GROUP = 2
-"""Group of the geoms of a scene."""
-_LEAST = 1e-6  # m: height and depth of a field, which MuJoCo wants above 0
+PICTURED: Mapping[str, float] = {
+    "contype": 0, "conaffinity": 0, "group": 2, "mass": 0.0, "density": 0.0,
+}  # fmt: skip
+"""Settings of geoms of a scene that touch and weigh nothing."""
 SKY = mujoco.mjtTexture.mjTEXTURE_SKYBOX
-HALL_XML = Path(__file__).with_name("hall.xml")
-"""Walls, windows, roof, lamps and racks of the warehouse."""
-
-GEOM_TYPES = [getattr(mjtGeom, f"mjGEOM_{kind.upper()}") for kind in KINDS]
-"""MuJoCo's, by `kernels.KINDS`."""
 _FLAT = mujoco.mjtBuiltin.mjBUILTIN_FLAT
 _PATTERNS = {
     "checker": (mujoco.mjtBuiltin.mjBUILTIN_CHECKER, mujoco.mjtMark.mjMARK_NONE),
@@ -47,58 +39,15 @@ def add_parts(spec: MjSpec, scene: SceneConfig) -> None:
     if scene.name == "warehouse":
         walls = MjSpec.from_file(str(HALL_XML))
         spec.attach(walls, prefix="warehouse/", frame=spec.worldbody.add_frame())
-    parts = parts_of(scene, scene.seed)
-    geoms = add_geoms(spec, scene.name, parts)
-    for geom, material in zip(geoms, parts.materials(), strict=True):
-        geom.material = f"{scene.name}/{material}"
-
-
-def add_geoms(spec: MjSpec, scene: str, parts: Parts) -> list[MjsGeom]:
-    """Add parts of a scene to a spec, which touch and weigh nothing."""
-    geoms = []
-    axes = parts.axes
-    for i, own in enumerate(parts.names()):
-        name = f"{scene}/{own}"
-        quaternion = np.empty(4)
-        mujoco.mju_mat2Quat(quaternion, axes[i].ravel())
-        shape = shape_of(spec, name, parts.sizes[i], parts.grids[i])
-        position = parts.positions[i] + least_of(parts.grids[i]) * axes[i, :, 2]
-        geom = spec.worldbody.add_geom(
-            name=name, type=GEOM_TYPES[parts.kinds[i]], pos=position, quat=quaternion,
-            contype=0, conaffinity=0, group=GROUP, mass=0.0, density=0.0, **shape,
-        )  # fmt: skip
-        geoms.append(geom)
-    return geoms
-
-
-def add_hulls(spec: MjSpec, content: str, **settings: int) -> None:
-    """Add the hulls of the content of a scene's file to a spec, as geoms with further settings."""
-    for name, one in hulls_of(content).items():
-        spec.add_mesh(name=name, uservert=np.ravel(one.vertices))
-        spec.worldbody.add_geom(
-            name=name, type=mjtGeom.mjGEOM_MESH, meshname=name, pos=one.position,
-            quat=one.attitude, rgba=(*one.color, 1.0), **settings,
-        )  # fmt: skip
-
-
-def shape_of(spec: MjSpec, name: str, size: Vector, grid: Array | None) -> dict[str, object]:
-    """Arguments of a geom for its size.
-
-    The heights of a `grid` above a position, m, (rows, columns), are added to the spec: the geom
-    lies at the least of them. Its size is half its width along x and y, and its depth below that
-    position.
-    """
-    if grid is None:
-        return {"size": size}
-    low = grid.min()
-    tall = max(grid.max() - low, _LEAST)
-    a, b, depth = np.asarray(size).tolist()
-    rows, columns = grid.shape
-    spec.add_hfield(
-        name=name, size=(a, b, tall, max(depth + low, _LEAST)), nrow=rows, ncol=columns,
-        userdata=((grid - low) / tall).ravel(),
-    )  # fmt: skip
-    return {"hfieldname": name}
+    draft = drafted(scene, scene.seed)
+    solids = Solids.drawn([draft])
+    geoms = iter(add_geoms(spec, solids, solids.names, PICTURED))
+    for block in draft.blocks:
+        for material, size in zip(block.materials(), block.numbers[1:4].T, strict=True):
+            geom = next(geoms)
+            geom.material = f"{scene.name}/{material}"
+            if geom.type == mjtGeom.mjGEOM_PLANE:  # it has no end but in pictures
+                geom.size = size
 
 
 class Painter:

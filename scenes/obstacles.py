@@ -2,12 +2,11 @@
 
 import json
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import fields
 from functools import lru_cache
 from typing import Annotated
 
-import mujoco
 import numpy as np
 
 from ..models.errors import InputError, shortened
@@ -22,11 +21,8 @@ from ..models.fields import (
     read_table,
 )
 from ..models.files import MAX_BYTES, parse_toml
-from ..models.matrices import settled
-from .fields import Rows, centered
-from .generators import Parts
+from .fields import Rows
 from .kernels import KINDS
-from .motion import REST
 from .registry import MAX_SOLIDS
 
 OWN = "own"
@@ -103,12 +99,6 @@ class Obstacle:
         length = math.hypot(*self.quaternion)
         return tuple(one / length for one in self.quaternion)
 
-    @property
-    def is_ground(self) -> bool:
-        """Whether it is level ground at z = 0 or below, which is in every scene."""
-        is_level = self.quaternion[1:3] == (0.0, 0.0)
-        return self.kind == "plane" and is_level and self.position[2] <= 0.0
-
 
 def to_content(obstacles: Iterable[Obstacle]) -> str:
     """Obstacles as the text of a TOML file. Raises `InputError` if it would be too long to read."""
@@ -149,34 +139,3 @@ def hulls_of(content: str) -> dict[str, Obstacle]:
         for i, one in enumerate(obstacles_of(content))
         if one.kind == HULL
     }
-
-
-def parts_of_obstacles(obstacles: Sequence[Obstacle]) -> Parts:
-    """All but hulls as parts of the scene `OWN`. Names have object and part, as those of our
-    scenes.
-    """
-    obstacles = [one for one in obstacles if one.kind != HULL]
-    count = len(obstacles)
-    sizes = np.zeros((count, 3))
-    axes = np.zeros((count, 3, 3))
-    centers = np.array([one.position for one in obstacles]).reshape(-1, 3)
-    grids = np.full(count, None)
-    for i, one in enumerate(obstacles):
-        sizes[i, : len(one.size)] = one.size
-        mujoco.mju_quat2Mat(axes[i].reshape(9), np.array(one.attitude))
-        if one.heights:
-            middle, grids[i] = centered(np.array(one.heights), one.size[2])
-            sizes[i, 2] += middle
-            centers[i] += middle * axes[i, :, 2]
-    return Parts(
-        names=lambda: [
-            f"{one.label or one.kind}_{i}/{one.kind}" for i, one in enumerate(obstacles)
-        ],
-        kinds=np.array([KINDS.index(one.kind) for one in obstacles], np.int8),
-        sizes=sizes,
-        positions=centers,
-        materials=lambda: [""] * count,
-        axes=settled(axes),
-        motions=np.zeros((count, len(REST))),
-        grids=grids,
-    )

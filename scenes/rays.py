@@ -116,61 +116,52 @@ class Rays:
             expected = f"whole numbers from 0 to {len(kinds) - 1}, one or {len(place)} of them"
             raise InputError(f"which: expected {expected}, got {shortened(which)}")
         scenes = np.full(len(place), scenes)
-        lanes, planes, whole, ends = self._packets
-        rows, columns = self.directions.shape[:2]
-        out = np.empty((len(place), rows * columns), np.float32)
+        out = np.empty((len(place), *self.reach.shape), np.float32)
         near = np.array(place, np.float32, order="C")
         code = kernels.compiled()
         run = code.packets if code else kernels.by_numpy
         run(
-            kinds, tables, scenes, near, _matrices(turn), lanes, planes, whole,
-            self._slots, ends, out,
+            kinds, tables, scenes, near, _matrices(turn), *self._packets,
+            out.reshape(len(place), self.reach.size),
         )  # fmt: skip
-        return out.reshape(-1, rows, columns)
+        return out
 
     @cached_property
-    def _tiles(self) -> NDArray[np.int64]:
-        """Numbers of the rays of each packet, (K, 16): tiles of a grid whose last rows and columns
-        are repeated."""
-        rows, columns = self.directions.shape[:2]
-        high = 4 if rows > 3 else min(rows, 2)
-        wide = LANES // high
-        numbers = np.arange(rows * columns).reshape(rows, columns)
-        numbers = np.pad(numbers, ((0, -rows % high), (0, -columns % wide)), mode="edge")
-        tiles = numbers.reshape(numbers.shape[0] // high, high, -1, wide)
-        return tiles.transpose(0, 2, 1, 3).reshape(-1, LANES)
-
-    @cached_property
-    def _slots(self) -> NDArray[np.uint64]:
-        """Where each ray is among those of the packets."""
-        slots = np.empty(self.directions[..., 0].size, np.uint64)  # unsigned: none is from the end
-        slots[self._tiles.ravel()] = np.arange(self._tiles.size)
-        return slots
-
-    @cached_property
-    def _packets(self) -> tuple[Array, Array, Array, Array]:
-        """Directions, planes about packets, planes about all rays, and how far these go, as
-        `kernels` has them.
+    def _packets(self) -> tuple[Array, Array, Array, NDArray[np.uint64], Array]:
+        """Directions, planes about packets, planes about all rays, where each ray is, and how far
+        they go, as `kernels` has them.
         """
         rays = self.directions.reshape(-1, 3)
-        tiles = rays[self._tiles]
+        reach = self.reach.ravel()
+        numbers = _tiles(*self.reach.shape)
+        slots = np.empty(len(rays), np.uint64)  # unsigned: none is from the end
+        slots[numbers.ravel()] = np.arange(numbers.size)
+        tiles = rays[numbers]
         lanes = tiles.transpose(0, 2, 1).reshape(-1, 3 * LANES)
         planes = np.array([_around(tile) for tile in tiles])  # (K, 5, 3)
         planes = np.pad(planes, ((0, -len(planes) % LANES), (0, 0), (0, 0)))
         blocks = planes.reshape(-1, LANES, 15).transpose(0, 2, 1).reshape(-1, 15 * LANES)
-        reach = self.reach.ravel()
         around = _around(rays)
         whole = np.zeros((6, 4))
         whole[:5, :3] = around
         whole[5] = (*-around[-1], (rays @ around[-1] * reach).max())
-        kept = whole if around.any() else whole[:0]
+        if not around.any():
+            whole = whole[:0]
         single = np.float32
-        return (
-            lanes.astype(single),
-            blocks.astype(single),
-            kept.astype(single),
-            (reach[self._tiles].astype(single)),
-        )
+        ends = reach[numbers].astype(single)
+        return lanes.astype(single), blocks.astype(single), whole.astype(single), slots, ends
+
+
+def _tiles(rows: int, columns: int) -> NDArray[np.int64]:
+    """Numbers of the rays of each packet, (K, 16): tiles of a grid whose last rows and columns are
+    repeated.
+    """
+    high = 4 if rows > 3 else min(rows, 2)
+    wide = LANES // high
+    numbers = np.arange(rows * columns).reshape(rows, columns)
+    numbers = np.pad(numbers, ((0, -rows % high), (0, -columns % wide)), mode="edge")
+    tiles = numbers.reshape(numbers.shape[0] // high, high, -1, wide)
+    return tiles.transpose(0, 2, 1, 3).reshape(-1, LANES)
 
 
 def _around(rays: np.ndarray) -> np.ndarray:

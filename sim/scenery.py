@@ -39,6 +39,8 @@ class Scenery(Kept):
 
     Attributes:
         scene: What is laid out.
+        given: Seeds of the given layouts; none where each episode has a new one.
+        most: Most solids of a layout, as `solids` has them.
         seeds: Of each world's layout, int64, shape (W,).
         layouts: Solids of all layouts in use.
         which: Number of each world's layout, shape (W,).
@@ -58,22 +60,20 @@ class Scenery(Kept):
         self.scene = scene
         self.hidden = hidden
         self.moves = scene.type.moves
-        self._given = np.array([one.seed for one in scene.given_scenes], np.int64)
-        self.seeds: Array = np.full(worlds, self._given[0] if self._given.size else -1, np.int64)
+        self.given = [one.seed for one in scene.given_scenes]
+        self.seeds: Array = np.full(worlds, self.given[0] if self.given else -1, np.int64)
         self.which: Array = np.zeros(worlds, np.int64)
         self._always = Solids.ground() + own
-        laid = [self._always + self.solids(seed) for seed in self._given.tolist()]
-        self.layouts = Layouts.of(*laid)
-        self._largest = max((len(one) - len(self._always) for one in laid), default=0)
+        laid = [self.solids(seed) for seed in self.given]
+        self.most: int = max(map(len, laid), default=scene.values.most)
+        self.layouts = Layouts.of(*[self._always + one for one in laid])
         self.openings: Array = np.zeros((worlds, *openings_of(scene, 0).shape))
-        opened = [openings_of(scene, seed) for seed in self._given.tolist()]
+        opened = [openings_of(scene, seed) for seed in self.given]
         self._openings = np.array([self._checked(one) for one in opened])
         if self.moves:  # each world has a time of its own
-            most = self.most
-            self._motions = np.zeros((worlds, most, len(REST)))
-            self._places = np.zeros((worlds, most, 3))
-            most += len(self._always.columns)
-            self.layouts = Layouts.empty(worlds, most, kernels.WAYS.stop)
+            self._motions = np.zeros((worlds, self.most, len(REST)))
+            self._places = np.zeros((worlds, self.most, 3))
+            self.layouts = Layouts.empty(worlds, len(self._always.columns) + self.most)
             self.which = np.arange(worlds)
             self._lay(np.flatnonzero(self.seeds >= 0))
         self.rows: Array
@@ -82,41 +82,21 @@ class Scenery(Kept):
 
     def __bool__(self) -> bool:
         """Whether anything may stand there."""
-        return not self._given.size or self.layouts.kinds.shape[1] > 1
-
-    @property
-    def most(self) -> int:
-        """Most solids of a layout, as `solids` has them."""
-        if not self._given.size:
-            most_drawn: int = self.scene.values.most
-            return most_drawn
-        return self._largest
+        return not self.given or self.layouts.kinds.shape[1] > 1
 
     def solids(self, seed: int) -> Solids:
         """What stands in a layout, without ground and `own`."""
-        return self._still(Solids.of_layout(self.scene, seed))
-
-    def _still(self, solids: Solids) -> Solids:
-        """The same. Raises `InputError` if it moves, in a scene that says that nothing does."""
-        if not self.moves and solids.motions.any():
-            raise InputError(f"scene: expected {self.scene.name} to be registered with moves=True")
-        return solids
+        return Solids.of_layout(self.scene, seed)
 
     @property
     def varies(self) -> bool:
         """Whether episodes differ in their layouts, or times in one."""
-        return len(self._given) != 1 or self.moves
-
-    @property
-    def given(self) -> list[int]:
-        """Seeds of the given layouts; none where each episode has a new one."""
-        seeds: list[int] = self._given.tolist()
-        return seeds
+        return len(self.given) != 1 or self.moves
 
     @property
     def numbers(self) -> Array:
         """Which of the given scenes each world has, shape (W,)."""
-        return np.searchsorted(self._given, self.seeds)
+        return np.searchsorted(self.given, self.seeds)
 
     def snapshot(self) -> Snapshot:
         """Copies by name: nothing where all have the same layout."""
@@ -129,8 +109,8 @@ class Scenery(Kept):
         if not self.varies or is_traced(mask):
             return
         share = Draw(random, SCENES, mask, ahead).uniform(0.0, 1.0)[:, 0]
-        if self._given.size:
-            drawn = looked_up(self._given, np.floor(share * len(self._given)))
+        if self.given:
+            drawn = looked_up(np.array(self.given), np.floor(share * len(self.given)))
         else:
             number = np.floor(share * NEW_SEEDS).astype(np.int64)
             drawn = 2 * number + (self.scene.layouts == "unseen")
@@ -142,7 +122,7 @@ class Scenery(Kept):
         old, self.seeds = self.seeds, seeds
         if is_traced(seeds):
             return
-        if self._given.size and not self.moves:
+        if self.given and not self.moves:
             self.which = self.numbers
         else:
             self._lay(np.flatnonzero((seeds != old) & (seeds >= 0)))
@@ -195,16 +175,14 @@ class Scenery(Kept):
         """
         refuse_hidden(self.hidden, "a task that reads distances")
         near = _single(position)
+        left = left if self.moves else 0.0
         if not self:
             return np.zeros_like(near[..., 0]) + np.float32(FAR)
         if due is not None:
             near = _held(near)
         if is_traced(near):
             mask = near[..., 0] == near[..., 0] if due is None else due
-            if self.moves:
-                near = stack([*parts_of(near), left, radius])
-                return self._called("nearest_then", mask, near)
-            return self._called("nearest", mask, near)
+            return self._called("nearest", mask, stack([*parts_of(near), left, radius]))
         found = np.zeros(near.shape[:-1], np.float32)
         mask = np.ones(found.shape, bool) if due is None else due
         code = kernels.compiled()
@@ -217,9 +195,7 @@ class Scenery(Kept):
         """Name of the first solid but the ground that a sphere touches in the first world."""
         solids = self._always + self.solids(int(self.seeds[0]))
         for number, name in enumerate(solids.names[1:], 1):
-            kinds = np.full_like(solids.columns, kernels.REST)
-            kinds[number] = solids.kinds[number]
-            if kernels.distances(kinds, solids.table, position[None]) <= radius:
+            if solids[number : number + 1].distance(position) <= radius:
                 return name
         return next(iter(self.hidden), "a solid")
 
@@ -234,10 +210,9 @@ class Scenery(Kept):
             return self._called("first", near[..., 0] == near[..., 0], near, ray)
         kinds, tables = self.layouts
         found = np.empty(near.shape[:-1], np.float32)
-        for world, drone in np.ndindex(found.shape):
-            layout = self.which[world]
-            found[world, drone] = kernels.first_by_numpy(
-                kinds[layout], tables[layout], near[world, drone], ray[world, drone]
+        for world, layout in enumerate(self.which.tolist()):
+            found[world] = kernels.first_by_numpy(
+                kinds[layout], tables[layout], near[world].T, ray[world].T
             )
         return np.minimum(found, np.float32(FAR))
 
@@ -248,7 +223,9 @@ class Scenery(Kept):
             raise Untraceable("a scene needs Numba, which the extra `fast` brings")
         layout = [row[:, None] for row in parts_of(self.rows)]
         numbers = [number for vector in vectors for number in parts_of(vector)]
-        return clip(call_outside(getattr(code, function), mask, *layout, *numbers), -FAR, FAR)
+        return clip(
+            call_outside(getattr(code, function).address, mask, *layout, *numbers), -FAR, FAR
+        )
 
     def _lay(self, worlds: NDArray[np.int64]) -> None:
         """Lay out what these worlds have: each has a row of its own."""
@@ -257,16 +234,12 @@ class Scenery(Kept):
         count = len(self.seeds)
         drafts = [drafted(self.scene, seed) for seed in self.seeds[worlds].tolist()]
         self.openings[worlds] = [self._checked(draft.ways) for draft in drafts]
-        layouts = map(self._still, Solids.of_drafts(drafts))
-        made = dict(zip(worlds.tolist(), layouts, strict=True))
-        kinds, tables = self.layouts
-        largest = max((len(one.columns) for one in made.values()), default=0)
-        most = max(kinds.shape[1], len(self._always.columns) + largest)
-        if kinds.shape != (count, most):
-            larger = Layouts.empty(count, most, tables.shape[1])
-            larger.kinds[: len(kinds), : kinds.shape[1]] = kinds
-            larger.tables[: len(kinds), :, : kinds.shape[1]] = tables
-            self.layouts = larger
+        made = dict(zip(worlds.tolist(), Solids.of_drafts(drafts), strict=True))
+        old = self.layouts.kinds
+        largest = max(len(one.columns) for one in made.values())
+        most = max(old.shape[1], len(self._always.columns) + largest)
+        if old.shape != (count, most):
+            self.layouts = self.layouts.enlarged(count, most)
             self.which = np.arange(count)
         for world, solids in made.items():
             self.layouts.put(world, self._always, solids)
@@ -298,7 +271,7 @@ class Scenery(Kept):
 
     def _point(self) -> None:
         """Set `rows`, and the openings of given layouts."""
-        if self._given.size and not self.moves:
+        if self.given and not self.moves:
             self.openings = self._openings[self.which]
         self.rows = rows_of(self.layouts, self.which)
         self._frozen = None

@@ -133,21 +133,20 @@ class MujocoWorld(World):
             expected = "a scene with height fields to have given seeds on mujoco, as hills:0-7"
             raise InputError(f"scene: expected {expected}, got {scenery.scene}")
         for number, seed in enumerate(scenery.given):
-            add_fields(spec, number, scenery.solids(seed))
+            add_fields(spec, scenery.solids(seed), f"{number}")
 
     def _lay(self, ids: np.ndarray) -> None:
         """Give geoms the layouts of some worlds."""
         if not self.scenery.varies:
             return
         seeds = self.scenery.seeds
+        most = self.scenery.most
         for world in ids[(self._laid[ids] != seeds[ids]) & (seeds[ids] >= 0)].tolist():
             solids = self.scenery.solids(int(seeds[world]))
-            for field, rows in geoms_of(solids, self.scenery.most).items():
+            layout = f"{self.scenery.numbers[world]}"
+            fields = fields_of(self._batch.model, solids, layout, most)
+            for field, rows in (geoms_of(solids, most) | fields).items():
                 self._batch.expand(field)[world, self._slots] = rows
-            if (solids.kinds == HFIELD).any():
-                which = fields_of(self._batch.model, int(self.scenery.numbers[world]), solids)
-                first = self._slots.start
-                self._batch.expand("geom_dataid")[world, first : first + len(which)] = which
             self._laid[world] = seeds[world]
         self._follow(ids)
 

@@ -10,7 +10,7 @@ from rotorgram.flights.trajectories import flown_trajectories, mean_traversabili
 from rotorgram.models import InputError
 from rotorgram.scenes import Solids
 from rotorgram.scenes.config import SceneConfig
-from rotorgram.scenes.generators import Draft, Parts
+from rotorgram.scenes.generators import Draft
 
 VFH = f"{Path(__file__).parents[2]}/examples/vfh.py:Vfh"
 
@@ -21,7 +21,7 @@ def walls() -> Solids:
     for x, y in ((1, 0), (-1, 0), (0, 1), (0, -1)):
         half = (0.1 + 5.0 * abs(y), 0.1 + 5.0 * abs(x), 2.0)
         draft.add(f"wall {x} {y}", "box", half, (5.1 * x, 5.1 * y, 2.0), "")
-    return Solids.of_parts(Parts.of([draft]), "room")
+    return Solids.drawn([draft])
 
 
 def test_traversability_of_an_empty_room() -> None:

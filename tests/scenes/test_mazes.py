@@ -238,7 +238,7 @@ def test_wrong_scenes_of_ones_own() -> None:
 
     for draw in (wrong, wrong_heading, wrong_motion):
         register("mine", SceneType(draw=draw, moves=True))
-        words = r"^scene: expected sizes, places, headings and motions within 1e6, .* in mine"
+        words = r"^scene: expected sizes, places, turns, motions within 1e6, .* in mine"
         with pytest.raises(InputError, match=words):
             Solids.of_scene("mine:2")
     register("mine", SceneType(draw=too_many, options=Two))
