@@ -62,8 +62,9 @@ def _places() -> dict[str, str]:
     for path in sorted((ROOT / "models" / "vehicles").glob("*/*")):
         place = f"vehicles/{path.parent.name}/{path.name.replace('README', 'index')}"
         places[path.relative_to(ROOT).as_posix()] = place
-    for path in sorted((ROOT / "examples").glob("*.py")):
-        places[f"examples/{path.name}"] = f"examples/{path.stem}.md"
+    for path in sorted((ROOT / "examples").rglob("*.py")):
+        name = path.relative_to(ROOT).as_posix()
+        places[name] = f"{name.removesuffix('.py')}.md"
     del places["docs/assets/mermaid/README.md"]
     return places
 

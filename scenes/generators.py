@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike as Vector
 from numpy.typing import NDArray
 
 from ..models.errors import InputError
-from ..models.fields import Limits, immutable
+from ..models.fields import Choice, Limits, check, immutable
 from ..models.files import read_own_toml
 from .aisles import AislesOptions, aisles
 from .config import SceneConfig
@@ -121,7 +121,7 @@ class Draft:
         motion: Sequence[float] = REST,
     ) -> None:
         """Add a part that is turned about z, rad, and moves as of `motion`."""
-        number = KINDS.index(kind)
+        number = KINDS.index(check(f"scene: kind of {name}", Choice(KINDS), kind))
         self.add_all(lambda: [name], number, size, position, lambda: [material], heading, motion)
 
     def add_ground(self, material: str, edge: float = 150.0) -> None:

@@ -53,7 +53,7 @@ def test_the_pages_of_the_api_name_modules_that_there_are() -> None:
 def test_the_navigation_has_every_page_once(stage: dict[str, Any]) -> None:
     """Zensical fails on a link that leads nowhere, but not on such an entry or a page without."""
     listed = pages_of(site()["nav"])
-    scripts = {f"examples/{path.stem}.md" for path in (ROOT / "examples").glob("*.py")}
+    scripts = {place for source, place in stage["_places"]().items() if source.endswith(".py")}
     pages = {place for place in stage["_places"]().values() if place.endswith(".md")}
     vehicles = {page for page in pages if page.startswith("vehicles/")}  # the library links to them
     library = (ROOT / "docs" / "library.md").read_text(encoding="utf-8")

@@ -241,6 +241,13 @@ def test_wrong_scenes_of_ones_own() -> None:
         words = r"^scene: expected sizes, places, turns, motions within 1e6, .* in mine"
         with pytest.raises(InputError, match=words):
             Solids.of_scene("mine:2")
+
+    def wrong_kind(draft: Draft) -> None:
+        draft.add("cone_0/tip", "cone", (1, 1, 1), (0, 0, 9), "")
+
+    register("mine", SceneType(draw=wrong_kind))
+    with pytest.raises(InputError, match=r"^scene: kind of cone_0/tip: expected 'sphere' or"):
+        Solids.of_scene("mine:3")
     register("mine", SceneType(draw=too_many, options=Two))
     try:
         with pytest.raises(InputError, match=r"^scene: expected at most 2 parts of mine, got 3"):
