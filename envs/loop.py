@@ -146,7 +146,7 @@ class Loop:
         record = self._record
         scenery = self._world.scenery
         if scenery.scene.is_seeded:
-            return record.unfit & False
+            return np.zeros_like(record.unfit)
         position = record.state.position
         radius = self.vehicle.radius
         starts = record.state.touching & (record.steps == 0) & ~record.waiting

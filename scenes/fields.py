@@ -99,7 +99,8 @@ class Rows:
         rows = np.array(value)
         if rows.dtype.kind not in "if" or rows.ndim != 2 or not (abs(rows) <= 1e3).all():
             raise ValueError
-        check_points(len(rows), rows.shape[1], "heights")
+        if min(rows.shape) < 2 or rows.size > MAX_POINTS:
+            raise ValueError
         return tuple(map(tuple, rows.astype(float).tolist()))
 
 

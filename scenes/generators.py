@@ -18,7 +18,7 @@ from ..models.files import read_own_toml
 from .aisles import AislesOptions, aisles
 from .config import SceneConfig
 from .fields import HillsOptions, centered, hills
-from .kernels import KINDS
+from .kernels import BOX, CAPSULE, CYLINDER, HFIELD, KINDS, SPHERE
 from .maze import MazeOptions, maze
 from .motion import REST
 from .options import CLEARANCE, Clear, SceneOptions, Size
@@ -26,8 +26,6 @@ from .registry import SceneType, register
 from .traffic import TrafficOptions, traffic
 
 Array = NDArray[np.float64]
-
-SPHERE, CAPSULE, CYLINDER, BOX, _, HFIELD = range(len(KINDS))
 
 _MATERIALS = read_own_toml(__file__, "materials")
 """By scene and name."""

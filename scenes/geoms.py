@@ -17,7 +17,6 @@ NAME = "rotorgram/solid"
 """Of a geom, before its number."""
 GEOM_TYPES = [getattr(mjtGeom, f"mjGEOM_{kind.upper()}").value for kind in kernels.KINDS]
 """MuJoCo's, by `kernels.KINDS`."""
-HFIELD = kernels.KINDS.index("hfield")
 # MuJoCo's compiler notes which geoms have the axes of their body, and turns these no more.
 _TURNED = (0.8, 0.0, 0.0, 0.6)
 _LEAST = 1e-6  # m: height and depth of a field, which MuJoCo wants above 0
@@ -93,7 +92,7 @@ def fields_of(
 
 
 def _fields(solids: Solids, layout: str) -> dict[int, str]:
-    rows = np.flatnonzero(solids.kinds == HFIELD).tolist()
+    rows = np.flatnonzero(solids.kinds == kernels.HFIELD).tolist()
     return {row: f"{NAME}{layout}_{row}" for row in rows}
 
 

@@ -24,6 +24,7 @@ from ..models.matrices import cross, dot
 KINDS = ("sphere", "capsule", "cylinder", "box", "plane", "hfield")
 """Capsule and cylinder stand along their third axis. That of a plane is its normal: what lies
 below is solid. A height field has two triangles in each cell of its grid, as MuJoCo's."""
+SPHERE, CAPSULE, CYLINDER, BOX, PLANE, HFIELD = range(len(KINDS))
 REST = len(KINDS)
 """Kind of the columns of a table that are no primitive."""
 HEADER = 3
@@ -35,7 +36,6 @@ _WHOLE = WAYS.stop  # rows of a layout
 LANES = 16
 """Rays of a packet."""
 
-_SPHERE, _CAPSULE, _CYLINDER, _BOX, _PLANE, _HFIELD = range(len(KINDS))
 _CENTER, _U, _V, _AXIS, _SIZE, _ROUNDING = 0, 3, 6, 9, 12, 15
 _ZERO = np.float32(0.0)
 _ONE = np.float32(1.0)
@@ -245,15 +245,15 @@ def _lines(x: Array, speed: Array, t: Array) -> Array:
 
 def _met(kind: Array, ray: Vector, solid: Array, table: Array, j: Array, reach: Array) -> Array:
     """As the formula of a kind."""
-    if kind == _SPHERE:
+    if kind == SPHERE:
         return _sphere(ray, solid)
-    if kind == _CAPSULE:
+    if kind == CAPSULE:
         return _capsule(ray, solid)
-    if kind == _CYLINDER:
+    if kind == CYLINDER:
         return _cylinder(ray, solid)
-    if kind == _BOX:
+    if kind == BOX:
         return _box(ray, solid)
-    if kind == _PLANE:
+    if kind == PLANE:
         return _plane(ray, solid)
     return _hfield(ray, (solid, table, j, reach))
 
@@ -311,24 +311,24 @@ def _gap(kind: Array, table: Array, j: Array, point: Vector, radius: Array) -> A
     along, across, up = _local(table, j, point)
     along, across = abs(along), abs(across)
     a, b, c = _three(table, _SIZE, j)
-    is_round = kind == _CYLINDER
+    is_round = kind == CYLINDER
     along = _pick(is_round, _root(along * along + across * across), along) - (a - radius)
     across = _pick(is_round, _ZERO, across) - (b - radius)
     over = abs(up) - (c - radius)
     inside = _least(_most(along, _most(across, over)), _ZERO)
     along, across, over = _most(along, _ZERO), _most(across, _ZERO), _most(over, _ZERO)
     gap = _root(along * along + across * across + over * over) + inside - radius
-    return _pick(kind == _PLANE, up, gap)
+    return _pick(kind == PLANE, up, gap)
 
 
 def _gap_then(
     kind: Array, table: Array, j: Array, point: Vector, left: Array, radius: Array
 ) -> Array:
-    """As `_gap`, while a share of its way is left to the primitive. Above a radius it is a lower
-    bound until the end of the step, but at least the radius.
+    """As `_gap`, of a primitive that still has a share of its way to go: exact below a radius;
+    otherwise at least the radius, and a lower bound until the end of the step.
 
-    So a craft touches now if it is below its radius, and need not look again while it is not, less
-    the craft's own way.
+    So a craft touches the primitive now if this is below the craft's radius. If not, it cannot
+    touch it in this step before it has itself flown the difference.
     """
     along, across, up = _three(table, ROWS, j)
     there = (point[0] + left * along, point[1] + left * across, point[2] + left * up)
@@ -362,7 +362,7 @@ def _gap_of_hfield(table: Array, j: Array, point: Vector) -> Array:
             square = _least(square, _least(_triangle(low, right, high), _triangle(low, high, left)))
     beyond = _most(aside, abs(over) * _number(table, j, _TWO))
     near = _least(_root(square), beyond)
-    return _most(_gap(_BOX, table, j, point, _ZERO), _pick(over < _ZERO, -near, near))
+    return _most(_gap(BOX, table, j, point, _ZERO), _pick(over < _ZERO, -near, near))
 
 
 def _corner(
@@ -401,7 +401,7 @@ def distances(
     kinds: Array, table: Array, points: Array, left: Array = _ZERO, radius: Array = _ZERO
 ) -> Array:
     """From points, (N, 3), to the nearest primitive of a table, m, (N,), by NumPy."""
-    plain = kinds < _HFIELD
+    plain = kinds < HFIELD
     solids = table[:, plain]
     point = points.T[:, :, None]
     everything = slice(None)
@@ -410,7 +410,7 @@ def distances(
     else:
         gaps = _gap(kinds[plain], solids, everything, point, solids[_ROUNDING])
     nearest: Array = gaps.min(axis=1, initial=np.inf)
-    for j in np.flatnonzero(kinds == _HFIELD).tolist():
+    for j in np.flatnonzero(kinds == HFIELD).tolist():
         nearest = _least(nearest, _gap_of_hfield(table, j, points.T))
     return nearest
 
@@ -421,17 +421,17 @@ def _nearest(kinds: Array, table: Array, point: Vector, left: Array, radius: Arr
     """
     others = _index(left > _ZERO)
     for j in range(1, kinds.size):
-        others += kinds[j] >= _HFIELD
+        others += kinds[j] >= HFIELD
     nearest = _BIG
     for j in range(1, kinds.size):
         kind = kinds[j]
         if others == 0:  # decided before the loop, which becomes vectors
             nearest = _least(nearest, _gap(kind, table, j, point, table[_ROUNDING, j]))
-        elif kind == _HFIELD:
+        elif kind == HFIELD:
             nearest = _least(nearest, _gap_of_hfield(table, j, point))
-        elif kind < _HFIELD and left > _ZERO:
+        elif kind < HFIELD and left > _ZERO:
             nearest = _least(nearest, _gap_then(kind, table, j, point, left, radius))
-        elif kind < _HFIELD:
+        elif kind < HFIELD:
             nearest = _least(nearest, _gap(kind, table, j, point, table[_ROUNDING, j]))
     return nearest
 
@@ -553,21 +553,21 @@ def _packets(
             if far[j] > _MARGIN or kind[j] == REST:
                 continue
             solid = _seen(table, j, place[w], attitude[w])
-            if kind[j] < _BOX:
+            if kind[j] < BOX:
                 _look(_depth_of_round, planes, solid, hits)
-            elif kind[j] == _PLANE:
+            elif kind[j] == PLANE:
                 hits[:] = 1
             else:
                 _look(_depth, planes, solid, hits)
-            if kind[j] == _SPHERE:
+            if kind[j] == SPHERE:
                 _meet(_sphere, solid, hit, directions, found)
-            elif kind[j] == _CAPSULE:
+            elif kind[j] == CAPSULE:
                 _meet(_capsule, solid, hit, directions, found)
-            elif kind[j] == _CYLINDER:
+            elif kind[j] == CYLINDER:
                 _meet(_cylinder, solid, hit, directions, found)
-            elif kind[j] == _BOX:
+            elif kind[j] == BOX:
                 _meet(_box, solid, hit, directions, found)
-            elif kind[j] == _PLANE:
+            elif kind[j] == PLANE:
                 _meet(_plane, solid, hit, directions, found)
             else:
                 _meet_hfield((solid, table, j, furthest), hit, directions, found)
@@ -576,17 +576,19 @@ def _packets(
 
 
 def _ranges(table: Array, place: Array, reach: Array, far: Array) -> None:
-    """Set how far primitives lie beyond the reach of rays from a place, m."""
+    """Set `far` to how far primitives lie beyond the reach of rays from a place, m."""
     for j in range(far.size):
-        far[j] = _gap(_BOX, table, j, (place[0], place[1], place[2]), _ZERO) - reach
+        far[j] = _gap(BOX, table, j, (place[0], place[1], place[2]), _ZERO) - reach
 
 
 def _hide(table: Array, place: Array, m: Array, planes: Array, bounds: Array, far: Array) -> None:
-    """Set it for what lies behind one of six planes of a sensor, by its place and the rows of its
-    attitude. `bounds` become the planes with normals in the world.
+    """Set `far` to a large number where a primitive lies behind one of six planes of a sensor, by
+    its place and the rows of its attitude. `bounds` become the planes with normals in the world.
     """
+    x_row, y_row, z_row = m[:3], m[3:6], m[6:]
     for f in range(6):
-        bounds[f, 0], bounds[f, 1], bounds[f, 2] = _along(planes[f], m[:3], m[3:6], m[6:])
+        x, y, z = _along(planes[f], x_row, y_row, z_row)
+        bounds[f, 0], bounds[f, 1], bounds[f, 2] = x, y, z
     for j in range(far.size):
         x, y, z = _three(table, _CENTER, j)
         center = (x - place[0], y - place[1], z - place[2])

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..models.fields import immutable
-from .kernels import KINDS
+from .kernels import BOX
 from .options import Clear, Size
 
 if TYPE_CHECKING:
@@ -73,7 +73,7 @@ def maze(draft: "Draft") -> None:
     count = int(kept.sum())
     draft.add_all(
         lambda: [f"wall_{i}/block" for i in range(count)],
-        KINDS.index("box"),
+        BOX,
         (*reach[kept].T, _HALF_HEIGHT),
         (*centers[kept].T, _HALF_HEIGHT),
         lambda: ["wall"] * count,

@@ -28,7 +28,6 @@ Array = NDArray[np.float64]
 
 MAX_CELLS = 1 << 26
 """Most cells of a grid, which takes 0.5 GB then."""
-_SPHERE, _, _CYLINDER, _, _PLANE, _HFIELD = range(len(kernels.KINDS))
 _SIZE = Limits(1e-4, 1e4, "m")
 _ENDLESS = 1e6  # m: half the width of a plane
 _SHEET = 5e-4  # m: half the thickness of a plane of a size, which lies below its face
@@ -184,7 +183,7 @@ class Solids:
             if not abs(center).max() <= _SIZE.high:
                 expected = f"solids within {_SIZE.high:g} m of the origin"
                 raise InputError(f"scene: expected {expected}, got {name}")
-            for one in half if kind != _PLANE else ():
+            for one in half if kind != kernels.PLANE else ():
                 check(f"scene: half a side of {name}", _SIZE, one)
         return solids
 
@@ -261,9 +260,9 @@ class Solids:
         table[:3] = self.centers.T
         table[3:12] = self.axes.transpose(2, 1, 0).reshape(9, -1)
         table[12:15] = self.halves.T
-        table[15] = np.where(self.kinds < _CYLINDER, table[12], 0.0)
+        table[15] = np.where(self.kinds < kernels.CYLINDER, table[12], 0.0)
         tables = [table]
-        grids = np.flatnonzero(self.kinds == _HFIELD).tolist()
+        grids = np.flatnonzero(self.kinds == kernels.HFIELD).tolist()
         for number in grids:
             table[-1, number] = sum(one.shape[1] for one in tables) - number
             tables.append(_columns_of(self.grids[number], self.halves[number]))
@@ -484,13 +483,13 @@ def _field_of(model: MjModel, geom: int) -> tuple[float, Array]:
 def _halves(kinds: NDArray[np.int8], sizes: Array) -> Array:
     """Half the sides of boxes about primitives of sizes as MuJoCo has them, m, (n, 3)."""
     a, b, c = sizes.T
-    is_round = kinds <= _CYLINDER
-    length = np.where(kinds == _SPHERE, 0.0, b) + np.where(kinds == _CYLINDER, 0.0, a)
+    is_round = kinds <= kernels.CYLINDER
+    length = np.where(kinds == kernels.SPHERE, 0.0, b) + np.where(kinds == kernels.CYLINDER, 0.0, a)
     half = np.empty((len(kinds), 3))
     half[:, 0] = a
     half[:, 1] = np.where(is_round, a, b)
     half[:, 2] = np.where(is_round, length, c)
-    half[kinds == _PLANE] = (_ENDLESS, _ENDLESS, 0.0)
+    half[kinds == kernels.PLANE] = (_ENDLESS, _ENDLESS, 0.0)
     return half
 
 

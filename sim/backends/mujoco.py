@@ -23,7 +23,8 @@ from ...models.vehicle import (
     owners,
     payload_radius,
 )
-from ...scenes.geoms import HFIELD, NAME, add_fields, add_solids, fields_of, geoms_of
+from ...scenes.geoms import NAME, add_fields, add_solids, fields_of, geoms_of
+from ...scenes.kernels import HFIELD
 from ...scenes.solids import Solids
 from ..effects import EffectOptions
 from ..randomize import CENTER, Randomization
