@@ -2,6 +2,8 @@
 
     python studies/forest.py [--seeds 5] [--first-seed 4100] [--flights 1000] [--out FILE.json]
     python studies/forest.py --vfh    # its flights anew, the others' as they are in the file
+    python studies/forest.py --set network=cnn "filters=[8, 16]" --out docs/results/forest_cnn.json
+    python studies/forest.py --set memory=64 "hidden=[64]" --out docs/results/forest_gru.json
 
 A training is `rotorgram train ppo --env rotorgram/Forest-v0` with its tuned preset, motor lag, the
 noise of the depth camera, 1 tree per 8 m², and a speed from 2.5 to 5.5 m/s drawn for each episode;
@@ -10,14 +12,17 @@ layouts at 3 and at 5 m/s, with 1 tree per 10 m² and per 8 m². Beside it `stra
 goal and looks at nothing, and `vfh` (VFH+) steers by a level lidar of 360 rays at 10 Hz. Intervals
 are Wilson's, at 95 %, of all flights of a row.
 
-It takes about 40 minutes on two cores.
+It takes about 40 minutes on two cores. Other settings than the preset's are given by `--set`, as
+to `rotorgram train`; `straight` and `vfh` do not fly beside them.
 """
 
 import json
+import shlex
 import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -51,9 +56,9 @@ class Straight:
         return np.clip(wanted / self._scale, -1.0, 1.0).astype(np.float32)
 
 
-def train(seed: int, folder: Path) -> float:
+def train(words: Sequence[str], seed: int, folder: Path) -> float:
     """Wall time of a training, s."""
-    command = [sys.executable, "-m", "rotorgram.cli", "train", *WORDS, "--seed", str(seed)]
+    command = [sys.executable, "-m", "rotorgram.cli", "train", *words, "--seed", str(seed)]
     began = time.perf_counter()
     subprocess.run([*command, "--out", str(folder)], check=True, stdout=subprocess.DEVNULL)
     return round(time.perf_counter() - began, 1)
@@ -109,39 +114,48 @@ def counted(env: LocalVectorEnv, last: np.ndarray) -> dict[str, Any]:
 
 def main() -> None:
     args = options(
-        __doc__, seeds=5, first_seed=4100, flights=1000, vfh=False, out=RESULTS / "forest.json"
-    ).parse_args()
-    steered = [fly_vfh(args.flights, *case) for case in CASES]
+        __doc__, seeds=5, first_seed=4100, flights=1000, vfh=False, set=[""],
+        out=RESULTS / "forest.json",
+    ).parse_args()  # fmt: skip
+    changes = [change for change in args.set if change]
+    beside: list[dict[str, Any]] = [{} for _ in CASES]
+    if not changes:
+        for case, row in zip(CASES, beside, strict=True):
+            row["vfh"] = fly_vfh(args.flights, *case)
     if args.vfh:
         content = json.loads(args.out.read_text())
-        for case, row in zip(content["cases"], steered, strict=True):
-            case["vfh"] = row
+        for case, row in zip(content["cases"], beside, strict=True):
+            case |= row
         write(args.out, content)
         return
+    if not changes:
+        for case, row in zip(CASES, beside, strict=True):
+            row["straight"] = fly(Straight, args.flights, *case, seed=0)
+    words = [*WORDS, *(["--set", *changes] if changes else [])]
     seeds: list[dict[str, Any]] = []
-    straight = [fly(Straight, args.flights, *case, seed=0) for case in CASES]
     for seed in range(args.first_seed, args.first_seed + args.seeds):
         with tempfile.TemporaryDirectory() as folder:
-            seconds = train(seed, Path(folder) / "run")
+            seconds = train(words, seed, Path(folder) / "run")
             kept = load(Path(folder) / "run" / "checkpoint.safetensors")
         rows = [fly(kept.policy, args.flights, *case, seed=seed) for case in CASES]
         seeds.append({"seed": seed, "seconds": seconds, "cases": rows})
         print(seed, seconds, [row["arrived"] for row in rows], flush=True)
-        cases = []
-        for number, (density, speed) in enumerate(CASES):
-            own = [one["cases"][number] for one in seeds]
-            flights = sum(row["flights"] for row in own)
-            arrived = sum(row["arrived"] for row in own)
-            low, high = share_interval(arrived, flights)
-            case = {"density": density, "speed": speed, "flights": flights, "arrived": arrived}
-            case |= {"share": round(arrived / flights, 4), "low": round(low, 4)}
-            case |= {"high": round(high, 4), "straight": straight[number]}
-            case["vfh"] = steered[number]
-            for name in MEANS:
-                case[name] = round(float(np.mean([row[name] for row in own])), 3)
-            cases.append(case)
-        command = f"rotorgram train {' '.join(WORDS)}"
+        cases = [summary(seeds, number) | row for number, row in enumerate(beside)]
+        command = f"rotorgram train {shlex.join(words)}"
         write(args.out, {"command": command, "cases": cases, "seeds": seeds})
+
+
+def summary(seeds: list[dict[str, Any]], number: int) -> dict[str, Any]:
+    """Of one of `CASES`, over seeds: the share that arrives with its interval, and means."""
+    own = [one["cases"][number] for one in seeds]
+    flights = sum(row["flights"] for row in own)
+    arrived = sum(row["arrived"] for row in own)
+    low, high = share_interval(arrived, flights)
+    density, speed = CASES[number]
+    case = {"density": density, "speed": speed, "flights": flights, "arrived": arrived}
+    case |= {"share": round(arrived / flights, 4), "low": round(low, 4), "high": round(high, 4)}
+    means = {name: np.mean([row[name] for row in own]) for name in MEANS}
+    return case | {name: round(float(mean), 3) for name, mean in means.items()}
 
 
 if __name__ == "__main__":
