@@ -21,6 +21,7 @@ from ..models.fields import (
     check_fields,
     check_names,
     immutable,
+    mapping,
     read_table,
     set_fields,
 )
@@ -154,9 +155,7 @@ class EnvConfig:
             set_fields(self, sensors=checked_sensors(self.sensors))
         if not isinstance(self.effects, EffectOptions):
             set_fields(self, effects=read_table(EffectOptions, self.effects, "effects"))
-        if not isinstance(self.task, Mapping):
-            raise InputError(f"task: expected options by name, got {shortened(self.task)}")
-        options: Options = self.task
+        options: Options = mapping(self.task, "task", "options by name")
         usual = SceneConfig()
         if registry.is_known(self.env_id):
             task = registry.task_type(self.env_id)
@@ -250,9 +249,7 @@ class EnvConfig:
     @classmethod
     def from_dict(cls, content: object) -> Self:
         """The reverse of `to_dict`. Raises `InputError`."""
-        if not isinstance(content, Mapping):
-            raise InputError(f"config: expected an object, got {shortened(content)}")
-        given = dict(content)
+        given = mapping(content, "config", "an object")
         version = given.pop("version", None)
         if version != VERSION:
             raise InputError(f"config: expected version {VERSION}, got {shortened(version)}")

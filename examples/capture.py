@@ -49,7 +49,7 @@ from rotorgram.models.swarm import drone_names
 from rotorgram.rendering.cameras import Cameras
 from rotorgram.rendering.gl import offscreen_context
 from rotorgram.scenes import parse_scene
-from rotorgram.sim.rotations import multiplied
+from rotorgram.sim.rotations import product
 from tyro.conf import Positional
 
 MOST_FRAMES = 64  # of a job
@@ -169,8 +169,9 @@ def _sequence(
     half = config.tilt * np.sqrt(rng.uniform(0, 1, shape)) / 2
     x = np.sin(half) * np.cos(axis)
     y = np.sin(half) * np.sin(axis)
-    tilts = np.stack((np.cos(half), x, y, np.zeros(shape)), axis=-1)
-    states = {"position": poses[..., :3] + moved, "quaternion": multiplied(tilts, poses[..., 3:])}
+    tilts = (np.cos(half), x, y, np.zeros(shape))
+    turned = product(tilts, np.moveaxis(poses[..., 3:], -1, 0))
+    states = {"position": poses[..., :3] + moved, "quaternion": np.stack(turned, axis=-1)}
     for name in ("goal", "payload"):
         if name in episode[0].telemetry:
             states[name] = _stacked([one.telemetry[name] for one in episode], rows)

@@ -158,8 +158,9 @@ def read_size(name: str, text: str, least: int, most: int) -> tuple[int, int]:
     match = re.fullmatch(r"([0-9]{1,4})x([0-9]{1,4})", text)
     width, height = map(int, match.groups()) if match else (0, 0)
     if min(width, height) < least or max(width, height) > most:
-        expected = f"WIDTHxHEIGHT of {least} to {most} pixels each"
-        raise InputError(f"{name}: expected {expected}, got {shortened(text)}")
+        raise InputError(
+            f"{name}: expected WIDTHxHEIGHT of {least} to {most} pixels each, got {shortened(text)}"
+        )
     return width, height
 
 
@@ -229,8 +230,10 @@ def steps_of(name: str, rate: str | float) -> int:
         steps = math.nan
     right = 1 <= steps <= _MAX_STEPS and abs(steps - round(steps)) < 1e-6 * steps
     if not right:
-        expected = f"1 over a whole number of control steps up to {_MAX_STEPS}"
-        raise InputError(f"{name}.rate: expected {expected}, got {rate}")
+        raise InputError(
+            f"{name}.rate: expected 1 over a whole number of control steps up to {_MAX_STEPS}, "
+            f"got {rate}"
+        )
     return round(steps)
 
 
@@ -253,7 +256,7 @@ def own_cameras(radius: float, rest_height: float) -> tuple[Camera, ...]:
     place = (0.0, 0.0, -0.75 * rest_height)
     return (
         Camera(name="front", position=(radius, 0.0, 0.0)),
-        Camera(name="down", position=place, look=down, up=(1.0, 0.0, 0.0)),
+        Camera(name="down", position=place, look=down, up=AHEAD),
     )
 
 

@@ -12,7 +12,7 @@ import numpy as np
 from mujoco import MjsBody, MjSpec, mjtGeom
 
 from .cameras import ORIGIN, UP, place_camera
-from .coefficients import PREFIX
+from .coefficients import COEFFICIENTS, PREFIX, as_tuple
 from .errors import InputError
 from .files import find_in_package, read_own_toml
 from .vehicle_file import Box, Cylinder, PlacedRotor, VehicleFile
@@ -45,10 +45,12 @@ def craft_spec(file: VehicleFile, base: MjSpec | None = None) -> MjSpec:
         if urdf:
             _free_root(spec, file.model.parent)
         _add_rotors(spec, file)
-    for name, values in file.coefficients.items():
-        numeric = spec.numeric(PREFIX + name) or spec.add_numeric(name=PREFIX + name)
-        numeric.size = len(values)
-        numeric.data = values
+    for number in file.numbers:
+        if number.name in COEFFICIENTS:
+            name = PREFIX + number.name
+            numeric = spec.numeric(name) or spec.add_numeric(name=name)
+            numeric.data = as_tuple(number.value)
+            numeric.size = len(numeric.data)
     for craft in free_bodies(spec)[:1]:
         for camera in file.cameras:
             body = spec.worldbody if camera.stands else craft

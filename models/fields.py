@@ -247,11 +247,8 @@ def read_table(kind: type[T], table: object, where: str) -> T:
     Names of fields stand behind `where` and a dot. Unknown, missing and wrong fields raise.
     """
     known = {one.name: one for one in fields(kind) if one.init}  # type: ignore[arg-type]
-    if not isinstance(table, Mapping):
-        names = ", ".join(known)
-        raise InputError(f"{where}: expected values by name ({names}), got {shortened(table)}")
-    check_names(table, known, where)
-    values = dict(table)
+    values = mapping(table, where, f"values by name ({', '.join(known)})")
+    check_names(values, known, where)
     for name, rule in rules_of(kind).items():
         if name in values:
             values[name] = check(f"{where}.{name}", rule, values[name])
@@ -260,6 +257,13 @@ def read_table(kind: type[T], table: object, where: str) -> T:
         if needed and name not in values:
             raise InputError(f"{where}: expected {name}, got none")
     return kind(**values)
+
+
+def mapping(given: object, where: str, expected: str = "a table") -> dict[str, Any]:
+    """A copy of values by name. Raises `InputError`."""
+    if not isinstance(given, Mapping):
+        raise InputError(f"{where}: expected {expected}, got {shortened(given)}")
+    return dict(given)
 
 
 def check_names(table: Iterable[str], known: Iterable[str], where: str) -> None:

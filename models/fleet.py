@@ -40,9 +40,9 @@ class Fleet(Vehicle):
         first = vehicles[0]
         for one in vehicles:
             if one.num_rotors != first.num_rotors:
-                expected = f"{first.num_rotors} rotors as of {first.name}"
                 raise InputError(
-                    f"vehicle: expected {expected}, got {one.num_rotors} of {one.name}"
+                    f"vehicle: expected {first.num_rotors} rotors as of {first.name}, "
+                    f"got {one.num_rotors} of {one.name}"
                 )
         step = min(one.timestep for one in vehicles)
         kinds = {one: _under(one, step, first.gravity) for one in vehicles}
@@ -84,9 +84,11 @@ def load_vehicles(
     """
     names = vehicle_words(vehicle) or (None,)
     if len(names) > drones:
-        expected = f"at most one vehicle for each of {drones} drones"
         got = ",".join(map(str, names))
-        raise InputError(f"vehicle: expected {expected}, got {len(names)}: {got}")
+        raise InputError(
+            f"vehicle: expected at most one vehicle for each of {drones} drones, "
+            f"got {len(names)}: {got}"
+        )
     found = [Vehicle.load(name, linear_drag=linear_drag) for name in names]
     if len(set(found)) == 1:
         return found[0]

@@ -60,8 +60,8 @@ def positions_in_world_frame(positions: ArrayLike) -> Array:
 def quaternions_in_world_frame(attitudes: ArrayLike) -> Array:
     """(phi, theta, psi), degrees, (..., 3) -> (w, x, y, z) in MuJoCo's world, (..., 4)."""
     halves = np.radians(np.moveaxis(np.asarray(attitudes, np.float64), -1, 0)) / 2
-    (a, b, c) = np.cos(halves)
-    (d, e, f) = np.sin(halves)
+    a, b, c = np.cos(halves)
+    d, e, f = np.sin(halves)
     # Ry(theta) · Rx(phi) · Rz(psi) as a quaternion about X, Y and Z.
     w = b * a * c + e * d * f
     x = b * d * c + e * a * f

@@ -50,6 +50,8 @@ def find_vehicle(vehicle: Path | str | None) -> Path:
         known = ", ".join(vehicle_names())
         raise InputError(f"vehicle: expected a file, or one of {known}, got {word!r:.300}")
     if path.suffix.lower() == ".urdf":
-        wanted = f"a TOML file that names the rotors, with [model] and file = {path.name!r}"
-        raise InputError(f"vehicle: expected {wanted}, got the URDF file itself")
+        raise InputError(
+            "vehicle: expected a TOML file that names the rotors, with [model] and "
+            f"file = {path.name!r}, got the URDF file itself"
+        )
     return path.resolve()

@@ -134,11 +134,9 @@ def check_sizes(path: Path, what: str) -> None:
     seen = {path}
     total = 0
     numbers = 0
-    waiting: list[tuple[ElementTree.Element, int, tuple[Path, ...]]]
-    waiting = [(read_xml(path), 1, (path,))]
+    waiting = [(read_xml(path), 1, [path])]
     while waiting:
         element, times, around = waiting.pop()
-        _check_element(element, what)
         if element.tag in _REPEATED:
             counts = filter(str.isdecimal, element.get("count", "").split())
             times *= math.prod(map(int, counts))
@@ -149,9 +147,9 @@ def check_sizes(path: Path, what: str) -> None:
             if inner not in seen:
                 _check_file(inner, what)
                 seen.add(inner)
-                waiting.append((read_xml(inner), times, (*around, inner)))
+                waiting.append((read_xml(inner), times, [*around, inner]))
         total += times
-        numbers += times * _numbers(element)
+        numbers += times * _numbers(element, what)
         if total > MAX_ELEMENTS:
             _refuse(what, f"at most {MAX_ELEMENTS} elements", f"{total} or more")
         if numbers > MAX_NUMBERS:
@@ -160,23 +158,24 @@ def check_sizes(path: Path, what: str) -> None:
         waiting += [(child, times, around) for child in element]
 
 
-def _check_element(element: ElementTree.Element, what: str) -> None:
+def _numbers(element: ElementTree.Element, what: str) -> int:
+    """How many numbers MuJoCo allocates for an asset, an actuator or a sensor, at least 1.
+
+    Raises `InputError` for an attribute of any element that is too large.
+    """
+    numbers = 1
     for name, most in (_LARGEST.get(element.tag, {}) | _LARGEST["any"]).items():
-        text = element.get(name, "0")
-        if _whole(text) > most:
+        text = element.get(name, "1")
+        number = _whole(text)
+        if number > most:
             _refuse(what, f"a {name} of at most {most} in <{element.tag}>", text)
+        if element.tag != "size":
+            numbers *= max(1, number)
     memory = element.get("memory", "0").strip().upper()
-    number = _whole(memory.rstrip(_UNITS))
-    if number << 10 * (_UNITS.find(memory[-1:]) + 1) > MAX_MEMORY:
+    size = _whole(memory.rstrip(_UNITS))
+    if size << 10 * (_UNITS.find(memory[-1:]) + 1) > MAX_MEMORY:
         _refuse(what, f"a memory of at most {MAX_MEMORY >> 30}G", memory)
-
-
-def _numbers(element: ElementTree.Element) -> int:
-    """How many numbers MuJoCo allocates for an asset, an actuator or a sensor, at least 1."""
-    names = dict(_LARGEST["any"])
-    if element.tag != "size":
-        names |= _LARGEST.get(element.tag, {})
-    return math.prod(max(1, _whole(element.get(name, "1"))) for name in names)
+    return numbers
 
 
 def _whole(text: str) -> int:

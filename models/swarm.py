@@ -51,9 +51,9 @@ def swarm_model(
             ours = getattr(first.model.opt, name)
             its = getattr(vehicle.model.opt, name)
             if not np.array_equal(ours, its):
-                got = f"{its} of {vehicle.name}"
                 raise InputError(
-                    f"vehicle: expected a {name} of {ours} as of {first.name}, got {got}"
+                    f"vehicle: expected a {name} of {ours} as of {first.name}, "
+                    f"got {its} of {vehicle.name}"
                 )
     spec, crafts = swarm_spec([vehicle.path for vehicle in vehicles], names)
     surround(spec)
@@ -102,14 +102,10 @@ def _check_cable(model: MjModel, cable: float, radius: float) -> None:
     data.qpos[7:10] = (0.0, 0.0, _HIGH - cable)
     mujoco.mj_fwdPosition(model, data)
     if data.ncon > 0:
-        clear = f"a payload with a radius of {radius:.3g} m hangs clear"
-        expected = f"expected a length at which {clear}"
-        raise InputError(f"effects.cable: {expected}, got {cable:g} m")
-
-
-def payload_body(model: MjModel) -> int:
-    """Id of the payload of a model with one."""
-    return int(model.body(PAYLOAD).id)
+        raise InputError(
+            f"effects.cable: expected a length at which a payload with a radius of {radius:.3g} m "
+            f"hangs clear, got {cable:g} m"
+        )
 
 
 def _count_contacts(spec: mujoco.MjSpec, name: str, craft: str, other: str = "") -> None:

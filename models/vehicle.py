@@ -40,9 +40,6 @@ _ROUNDED = 1e-5  # of the weight, sideways: what a file's six digits leave
 PAYLOAD = "rotorgram/payload"
 """Name of a payload's body."""
 
-SURROUNDINGS = (True, False, False, False, False, False)
-"""Of a vehicle's model the groups of geoms that are not the craft's, for rays."""
-
 
 @immutable
 class Rotor:
@@ -246,20 +243,26 @@ def _check_flyable(model: MjModel) -> None:
         raise InputError(f"vehicle: expected a mass of at most {_MAX_MASS:g} kg, got {heaviest:g}")
     free = int((model.jnt_type == mujoco.mjtJoint.mjJNT_FREE).sum())
     if (free, model.njnt) != (1, 1):
-        got = f"{free} free of {model.njnt} joints"
-        raise InputError(f"vehicle: expected one free body and no other joints, got {got}")
+        raise InputError(
+            "vehicle: expected one free body and no other joints, "
+            f"got {free} free of {model.njnt} joints"
+        )
     if not model.nu:
         raise InputError("vehicle: expected at least one rotor, an actuator at a site, got none")
     mass = float(model.body_subtreemass[model.jnt_bodyid[0]])
     gravity = model.opt.gravity
     falls = mass > 0 and gravity[2] < 0 and not gravity[:2].any()
     if not falls:
-        got = f"{mass:g} kg and {gravity.tolist()} m/s²"
-        raise InputError(f"vehicle: expected a mass > 0 and gravity along -z, got {got}")
+        raise InputError(
+            "vehicle: expected a mass > 0 and gravity along -z, "
+            f"got {mass:g} kg and {gravity.tolist()} m/s²"
+        )
     step = model.opt.timestep
     if not _LEAST_TIMESTEP <= step <= _MAX_TIMESTEP:
-        limits = f"at least {_LEAST_TIMESTEP:g} s and at most {_MAX_TIMESTEP:g} s"
-        raise InputError(f"vehicle: expected a physics step of {limits}, got {step:g}")
+        raise InputError(
+            f"vehicle: expected a physics step of at least {_LEAST_TIMESTEP:g} s and at most "
+            f"{_MAX_TIMESTEP:g} s, got {step:g}"
+        )
 
 
 @lru_cache(maxsize=32)
@@ -280,7 +283,7 @@ def _load(path: Path, drag: float, changed: tuple[int, ...]) -> Vehicle:
         columns.append((rotor.axis[2], *torque))
     allocation = np.array(columns).T
     model.dof_damping[0:3] = drag * mass
-    model.geom_group[:] = craft_geoms(model)  # see `SURROUNDINGS`
+    model.geom_group[:] = craft_geoms(model)  # what rays do not see
     return Vehicle(
         path=path,
         name=str(spec.modelname),
@@ -380,14 +383,16 @@ def _hover(rotors: tuple[Rotor, ...], allocation: Array, weight: float) -> Array
             "sideways force, got ones that cannot"
         )
     for rotor, newtons in zip(rotors, thrust.tolist(), strict=True):
-        carries = f"rotor {rotor.name} to carry"
         if not newtons > _RELATIVE * weight:
-            part = f"{carries} a part of the weight of the level craft"
-            raise InputError(f"vehicle: expected {part}, got {newtons:.4g} N")
+            raise InputError(
+                f"vehicle: expected rotor {rotor.name} to carry a part of the weight of the level "
+                f"craft, got {newtons:.4g} N"
+            )
         if not rotor.low <= newtons < rotor.high:
-            share = f"{carries} its share of the weight, {newtons:.4g} N, within its limits"
-            got = f"{rotor.low:g} to {rotor.high:g} N"
-            raise InputError(f"vehicle: expected {share}, got {got}")
+            raise InputError(
+                f"vehicle: expected rotor {rotor.name} to carry its share of the weight, "
+                f"{newtons:.4g} N, within its limits, got {rotor.low:g} to {rotor.high:g} N"
+            )
     return thrust
 
 
@@ -411,8 +416,10 @@ def _find_rest_height(model: MjModel, data: MjData) -> float:
     while _touches(model, data, high):
         high *= 2
         if high > _MAX_HEIGHT:
-            got = f"one that touches something at {high:.0f} m"
-            raise InputError(f"vehicle: expected a craft that is free above the ground, got {got}")
+            raise InputError(
+                "vehicle: expected a craft that is free above the ground, "
+                f"got one that touches something at {high:.0f} m"
+            )
     while high - low > 1e-10 * high:
         middle = (low + high) / 2
         if _touches(model, data, middle):

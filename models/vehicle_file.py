@@ -14,9 +14,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .cameras import AHEAD, ORIGIN, OUTPUTS, UP, Axis, Camera, Place, steps_of
-from .coefficients import COEFFICIENTS, as_tuple, table_of
+from .coefficients import COEFFICIENTS, table_of
 from .errors import InputError, shortened
-from .fields import Choice, Limits, T, Text, check, immutable, limits_of, printable, read_table
+from .fields import (
+    Choice,
+    Limits,
+    T,
+    Text,
+    check,
+    immutable,
+    limits_of,
+    mapping,
+    printable,
+    read_table,
+)
 from .files import read_toml
 
 _Numbers = tuple[float, ...]
@@ -158,12 +169,6 @@ class VehicleFile:
     cameras: tuple[Camera, ...]
 
     @property
-    def coefficients(self) -> dict[str, _Numbers]:
-        """Those of effects and sensors, by "group.name"."""
-        ours = [number for number in self.numbers if number.name in COEFFICIENTS]
-        return {number.name: as_tuple(number.value) for number in ours}
-
-    @property
     def real_flights(self) -> str:
         """Mean error of its simulation after half a second of recorded flights; empty: unknown."""
         errors = [one for one in self.numbers if one.name.startswith("real_flights.")]
@@ -211,7 +216,7 @@ def model_of(path: Path) -> Path:
 
 def _table(numbers: _Found, kind: type[T], given: object, where: str) -> T:
     """A table as its dataclass; its numbers are added to those of the file."""
-    table = _mapping(given, where)
+    table = mapping(given, where)
     source = check(f"{where}.source", Text(), table.pop("source", ""))
     prefix = "" if where == "vehicle" else f"{where}."
     for key, limits in limits_of(kind).items():
@@ -228,7 +233,7 @@ def _number(name: str, limits: Limits, given: object, source: str) -> Number:
     sourced = read_table(_Sourced, table, name)
     others = []
     for where, other in _listed(sourced.others, f"{name}.others"):
-        others.append(_number(where, limits, _mapping(other, where), ""))
+        others.append(_number(where, limits, mapping(other, where), ""))
     return Number(
         name=name,
         value=check(name, limits, sourced.value),
@@ -237,13 +242,6 @@ def _number(name: str, limits: Limits, given: object, source: str) -> Number:
         why=sourced.why,
         others=tuple(others),
     )
-
-
-def _mapping(given: object, where: str) -> dict[str, Any]:
-    """A copy of a table."""
-    if not isinstance(given, Mapping):
-        raise InputError(f"{where}: expected a table, got {shortened(given)}")
-    return dict(given)
 
 
 def _listed(given: object, where: str) -> list[tuple[str, Any]]:
@@ -273,7 +271,7 @@ def _body(numbers: _Found, given: object, model: Path | None) -> Body:
         return Body()
     if given is None:
         raise InputError("vehicle: expected a table [body], or [model] with a file, got neither")
-    table = _mapping(given, "body")
+    table = mapping(given, "body")
     listed = _listed(table.pop("parts", ()), "body.parts")
     body = _table(numbers, Body, table, "body")
     parts = tuple(_part(numbers, one, where) for where, one in listed)
@@ -293,7 +291,7 @@ def _body(numbers: _Found, given: object, model: Path | None) -> Body:
 
 
 def _part(numbers: _Found, given: object, where: str) -> Box | Cylinder:
-    shape = _mapping(given, where).get("shape")
+    shape = mapping(given, where).get("shape")
     kind = check(f"{where}.shape", Choice(tuple(_SHAPES)), shape)
     return _table(numbers, _SHAPES[kind], given, where)
 
@@ -302,7 +300,7 @@ def _rotors(numbers: _Found, given: object, model: Path | None) -> RotorTable:
     mjcf = model is not None and model.suffix.lower() == ".xml"
     if given is None and not mjcf:
         raise InputError("vehicle: expected a table [rotors], got none")
-    table = _mapping({} if given is None else given, "rotors")
+    table = mapping({} if given is None else given, "rotors")
     listed = enumerate(_listed(table.pop("list", ()), "rotors.list"), 1)
     rotors = _table(numbers, RotorTable, table, "rotors")
     placed = tuple(_rotor(numbers, one, where, i, model) for i, (where, one) in listed)
@@ -357,7 +355,7 @@ def _with_thrust(rotors: RotorTable) -> RotorTable:
 def _rotor(
     numbers: _Found, given: object, where: str, number: int, model: Path | None
 ) -> PlacedRotor:
-    table = {"name": f"rotor{number}", **_mapping(given, where)}
+    table = {"name": f"rotor{number}", **mapping(given, where)}
     rotor = _table(numbers, PlacedRotor, table, where)
     places = [name for name in ("link", "body", "site") if getattr(rotor, name) is not None]
     if model is None:
@@ -396,7 +394,7 @@ def _framed(rotors: RotorTable, frame: str) -> RotorTable:
 
 
 def _camera(numbers: _Found, given: object, where: str) -> Camera:
-    has_up = "up" in _mapping(given, where)
+    has_up = "up" in mapping(given, where)
     camera = _table(numbers, Camera, given, where)
     look = camera.look
     up = camera.up

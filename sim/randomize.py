@@ -5,13 +5,13 @@ A parameter is a factor of the vehicle's own value, 1 being that value, or a num
 
 import math
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from ..models.errors import InputError, shortened
-from ..models.fields import check_names
+from ..models.fields import check_names, mapping
 from ..models.files import read_own_toml
 from .effects import EffectOptions
 from .elementary import exp, log
@@ -53,13 +53,10 @@ class Randomization:
     """
 
     def __init__(self, texts: object, effects: EffectOptions | None) -> None:
-        if not isinstance(texts, Mapping):
-            raise InputError(
-                f"randomize: expected a mapping from names to distributions, got {shortened(texts)}"
-            )
         self._kinds: dict[str, tuple[str, tuple[float, ...]]] = {}
-        check_names(texts, PARAMETERS, "randomize")
-        for name, text in texts.items():
+        given = mapping(texts, "randomize", "a mapping from names to distributions")
+        check_names(given, PARAMETERS, "randomize")
+        for name, text in given.items():
             needs = PARAMETERS[name].needs
             if needs and effects and not any(getattr(effects, effect) for effect in needs):
                 raise InputError(

@@ -73,8 +73,8 @@ def _turned(quaternion: Array, vector: Array, sign: float) -> Array:
     w = w * sign
     v = parts_of(vector)
     t = [2 * part for part in cross(axis, v)]
-    (x, y, z) = axis
-    (p, q, r) = t
+    x, y, z = axis
+    p, q, r = t
     return stack((
         v[0] + w * p + y * r - z * q,
         v[1] + w * q + z * p - x * r,
@@ -110,11 +110,6 @@ def euler(quaternion: Array) -> tuple[Array, Array, Array]:
     pitch = atan2(sine, square_root((1 - sine) * (1 + sine)))
     yaw = atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
     return roll, pitch, yaw
-
-
-def multiplied(a: Array, b: Array) -> Array:
-    """Product of quaternions, shape (..., 4): b in the frame that a turns."""
-    return stack(product(parts_of(a), parts_of(b)))
 
 
 def between(a: Array, b: Array) -> Array:

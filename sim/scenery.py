@@ -251,8 +251,10 @@ class Scenery(Kept):
     def _checked(self, found: Array) -> Array:
         """Openings of a layout. Raises `InputError` unless there are as many as in all others."""
         if found.shape != self.openings.shape[1:]:
-            expected = f"{self.openings.shape[1]} openings in each layout of {self.scene.name}"
-            raise InputError(f"scene: expected {expected}, got {len(found)}")
+            raise InputError(
+                f"scene: expected {self.openings.shape[1]} openings in each layout of "
+                f"{self.scene.name}, got {len(found)}"
+            )
         return found
 
     @property

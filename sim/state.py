@@ -25,13 +25,13 @@ ByName = dict[str, Array]
 class WorldState:
     """Live arrays: a step or a reset of the world writes into them. Read them, never write."""
 
-    position: Array
+    position: Array = None
     """Of each body's origin, world frame, m, shape (W, A, 3)."""
-    quaternion: Array
+    quaternion: Array = None
     """From body to world frame, scalar first, shape (W, A, 4)."""
-    velocity: Array
+    velocity: Array = None
     """Of each body's origin, world frame, m/s, shape (W, A, 3)."""
-    body_rates: Array
+    body_rates: Array = None
     """Angular velocity, body frame, rad/s, shape (W, A, 3)."""
     command: Array
     """Thrust that the controller last asked of each rotor, N, shape (W, A, R)."""

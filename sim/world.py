@@ -18,7 +18,7 @@ from .compile.llvm import trouble
 from .effects import NO_EFFECTS, EffectOptions, Effects
 from .random import RANDOMIZATION, START, Draw, Random
 from .randomize import FIXED, Randomization
-from .snapshots import Arrays, Snapshot, joined, part_of
+from .snapshots import Arrays, Kept, Snapshot, joined, part_of
 from .state import FAR, Array, ByName, InitialState, WorldState, chosen
 
 if TYPE_CHECKING:
@@ -61,7 +61,7 @@ class Call:
     """Share of the control step after it."""
 
 
-class World(NotCopied):
+class World(Kept, NotCopied):
     """W worlds of A drones; a seed gives the same draws on each backend, which sets `state`.
 
     Attributes:
@@ -84,10 +84,8 @@ class World(NotCopied):
     """Whether the physics is code of its own, which cannot be compiled with the stages."""
     of_state: ClassVar[Sequence[str]] = WorldState.__slots__
     """Names of the state's arrays that a snapshot has."""
-    arrays: ClassVar[Sequence[str]] = ("acting", "wrench")
-    """Names of further arrays of it, which are attributes."""
+    arrays: ClassVar[tuple[str, ...]] = ("acting", "wrench")
 
-    state: WorldState
     acting: Array
     wrench: Array
 
@@ -115,6 +113,7 @@ class World(NotCopied):
         self.acting = self._nothing = np.zeros((*shape, vehicle.num_rotors), self.dtype)
         self.wrench = np.zeros((*shape, 6), self.dtype) if self.effects.on_body else None
         self.bad = self.acting[..., 0] > 0
+        self.state = WorldState(command=self.acting, thrust=self.acting, touching=self.bad)
         self.outer: ByName = {}
         self.asked: set[str] = set()
 
@@ -232,26 +231,24 @@ class World(NotCopied):
     def snapshot(self) -> Snapshot:
         """Copies of all arrays that a later step depends on, by name."""
         state = {name: getattr(self.state, name) for name in self.of_state}
-        state |= {name: getattr(self, name) for name in self.arrays}
-        parts: ByName = {"state": state | self.hidden(), "parameters": self.parameters}
-        kept = {"random": self.random, "effects": self.effects, "scenery": self.scenery}
-        return joined(parts | {name: one.snapshot() for name, one in kept.items()})
+        own: ByName = {"state": state | self.hidden(), "parameters": self.parameters}
+        return super().snapshot() | joined(own)
 
     def restore(self, arrays: Arrays) -> None:
         """Put a snapshot back; no step runs. No later bit differs from those that followed it."""
         arrays = {name: array.copy() for name, array in arrays.items()}
-        self.random.restore(part_of(arrays, "random"))
-        self.effects.restore(part_of(arrays, "effects"))
-        self.scenery.restore(part_of(arrays, "scenery"))
+        super().restore(arrays)
         self.parameters = part_of(arrays, "parameters")
         self.effects.take(self.parameters)
         self._vary(self.parameters)
         state = part_of(arrays, "state")
         for name in self.of_state:
             setattr(self.state, name, state.get(name))
-        for name in self.arrays:
-            setattr(self, name, state.get(name))
         self._put(state)
+
+    def parts(self) -> Mapping[str, Kept]:
+        """The counters, the effects and the scenery."""
+        return {"random": self.random, "effects": self.effects, "scenery": self.scenery}
 
     def place(self, mask: Array) -> None:
         """The part of `reset` that is physics: take the state of the worlds of a mask."""

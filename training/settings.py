@@ -30,6 +30,7 @@ from ..models.fields import (
     PositiveInt,
     check_fields,
     immutable,
+    mapping,
     read_table,
     set_fields,
 )
@@ -198,9 +199,9 @@ class Row:
         Raises `InputError`, whose sentence begins with `where`.
         """
         try:
-            given = _table("row", table)
-            given["set"] = _table("set", given.get("set", {}))
-            own = _table("env", given.get("env", {}))
+            given = mapping(table, "row")
+            given["set"] = mapping(given.get("set", {}), "set")
+            own = mapping(given.get("env", {}), "env")
             keywords = {"env_id": DEFAULT_ENV, **(env or {}), **own}
             env_id = load(keywords.pop("env_id"))
             given["env"] = EnvConfig.from_keywords(env_id, **keywords)
@@ -284,8 +285,8 @@ class Study:
 
         Raises `InputError`, whose sentence begins with `where`.
         """
-        given = _table(where, content)
-        env = _table(f"{where}: env", given.pop("env", {}))
+        given = mapping(content, where)
+        env = mapping(given.pop("env", {}), f"{where}: env")
         tables = given.pop("row", [])
         if "rows" in given:
             raise InputError(f"{where}: rows: expected [[row]] tables, got the name rows")
@@ -307,9 +308,3 @@ class Study:
         if "row" not in content:
             content = {"row": [{"name": path.stem, **content}]}
         return cls.from_dict(f"{path}", {**(defaults or {}), **content})
-
-
-def _table(where: str, table: object) -> dict[str, Any]:
-    if not isinstance(table, dict):
-        raise InputError(f"{where}: expected a table, got {shortened(table)}")
-    return dict(table)

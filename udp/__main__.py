@@ -15,7 +15,8 @@ from typing import Any
 
 from ..envs import registry
 from ..envs.config import EnvConfig
-from ..models.errors import InputError, MissingPackage, NoOpenGL, shortened
+from ..models.errors import InputError, MissingPackage, NoOpenGL
+from ..models.fields import mapping
 from .protocol.client import LinkConfig
 from .protocol.errors import LinkError
 from .transport.simulator import Simulator
@@ -61,8 +62,7 @@ def read_arguments(line: bytes) -> tuple[EnvConfig, dict[str, Any]]:
         arguments = json.loads(line)
     except (ValueError, RecursionError) as error:
         raise InputError(f"standard input: expected a JSON object: {error}") from None
-    if not isinstance(arguments, dict):
-        raise InputError(f"standard input: expected a JSON object, got {shortened(arguments)}")
+    arguments = mapping(arguments, "standard input", "a JSON object")
     content = arguments.pop("config", None)
     if module := arguments.pop("module", None):
         registry.load(f"{module}:{dict(content or {}).get('env_id', '')}")

@@ -33,14 +33,14 @@ _NOTHING = 1e-12  # of the largest number of its kind: what rounding leaves
 _ZERO: Final[Vector] = (0.0, 0.0, 0.0)
 _FURTHEST = (4 * math.pi) ** 2
 _BORTZ = (
-    0.03267274151216445,
-    0.00010564110705334667,
-    5.637370282876806e-07,
-    3.3571419266571038e-09,
     2.0742872904159143e-11,
+    3.3571419266571038e-09,
+    5.637370282876806e-07,
+    0.00010564110705334667,
+    0.03267274151216445,
 )
-"""Of Bortz's coefficient without its pole at a turn, powers 0, 2... of the angle:
-2 (ζ(2 n) - 1) / (2 π)^(2 n), n = 1 to 5, with Riemann's ζ."""
+"""Of Bortz's coefficient without its pole at a turn, powers 8, 6... of the angle:
+2 (ζ(2 n) - 1) / (2 π)^(2 n), n = 5 to 1, with Riemann's ζ."""
 _CROSS = np.cross(np.eye(3)[:, None], np.eye(3)[None]).transpose(2, 0, 1)
 """Of a cross product: (a × b)ᵢ = Σ _CROSS[i, j, k] aⱼ bₖ."""
 _PAIRS = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
@@ -189,7 +189,7 @@ class RigidBody:
     def advance(self, now: Motion, push: Push) -> Motion:
         """The motion after a physics step."""
         h = self._step
-        (position, quaternion, velocity, rates) = now
+        position, quaternion, velocity, rates = now
         stages = [(*self.acceleration(now, push), rates)]
         for part in (0.5 * h, 0.5 * h, h):
             linear, angular, spin = stages[-1]
@@ -289,8 +289,8 @@ def _scaled(vector: Array, share: Array) -> Vector:
 
 
 def _cross(a: Array, b: Array) -> Vector:
-    (p, q, r) = a
-    (x, y, z) = b
+    p, q, r = a
+    x, y, z = b
     return (
         added(0.0, (q, z), (-1.0, r, y)),
         added(0.0, (r, x), (-1.0, p, z)),
@@ -314,16 +314,14 @@ def _to_world(quaternion: Array, vector: Vector) -> Vector:
 
 
 @cache
-def _series(dtype: np.dtype[Any]) -> tuple[tuple[float, ...], tuple[float, ...]]:
+def _series(dtype: np.dtype[Any]) -> tuple[list[float], list[float]]:
     """Taylor's series of cos(x) and sin(x) / x in x²: up to x = π / 2 the next terms are below the
     rounding.
     """
-    terms = 8 if dtype == np.float32 else 13
-    signs = [(-1) ** n for n in reversed(range(terms))]
-    powers = [2 * n for n in reversed(range(terms))]
-    cosine = [sign / factorial(power) for sign, power in zip(signs, powers, strict=True)]
-    sine = [sign / factorial(power + 1) for sign, power in zip(signs, powers, strict=True)]
-    return tuple(cosine), tuple(sine)
+    terms = range(8 if dtype == np.float32 else 13)[::-1]
+    cosine = [(-1) ** n / factorial(2 * n) for n in terms]
+    sine = [(-1) ** n / factorial(2 * n + 1) for n in terms]
+    return cosine, sine
 
 
 def _rotated(quaternion: Array, rates: Vector, time: float) -> tuple[Array, Array]:
@@ -349,10 +347,8 @@ def _of_rotation_vector(spin: Vector, time: float, square: Array, rates: Vector)
     IEEE Trans. AES-7, 1971): the sum of 2 / ((2 π n)² - |r|²) over n > 0. Here up to |r| = π.
     """
     square = np.minimum(square, math.pi**2)
-    series = square * _BORTZ[-1]
-    for one in _BORTZ[-2:0:-1]:
-        series = (series + one) * square
-    series = (series + _BORTZ[0] + 2.0 / (4 * math.pi**2 - square)) * (time * time)
+    series = elementary.polynomial(square, _BORTZ)
+    series = (series + 2.0 / (4 * math.pi**2 - square)) * (time * time)
     once = _cross(spin, rates)
     twice = _cross(spin, once)
     return tuple(

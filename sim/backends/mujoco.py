@@ -15,9 +15,9 @@ from mujoco.batch import Batch, SimulationError
 from ...models.errors import InputError
 from ...models.fleet import members_of
 from ...models.mjcf import add_ground, delete_obstacles
-from ...models.swarm import CONTACTS, GROUNDED, contact_columns, payload_body, swarm_model
+from ...models.swarm import CONTACTS, GROUNDED, contact_columns, swarm_model
 from ...models.vehicle import (
-    SURROUNDINGS,
+    PAYLOAD,
     Vehicle,
     body_axes,
     owners,
@@ -31,11 +31,11 @@ from ..randomize import CENTER, Randomization
 from ..rotations import body_z
 from ..scenery import Scenery
 from ..snapshots import Arrays
-from ..state import Array, ByName, InitialState, WorldState, found, stack, total
+from ..state import Array, ByName, InitialState, found, stack, total
 from ..world import Call, PhysicsError, World
 
 _FEW = 8
-_SEEN = np.array(SURROUNDINGS, np.uint8)
+_SEEN = np.array([1, 0, 0, 0, 0, 0], np.uint8)  # by rays: geoms of group 0, not the crafts'
 _VIEWS = "_batch _live _ctrl _applied _contacts _counts _warnings _varied _qacc _warmstart"
 """Attributes that hold the simulator's memory."""
 
@@ -100,8 +100,6 @@ class MujocoWorld(World):
         rotors = [rotor for craft in members_of(vehicle, drones) for rotor in craft.rotors]
         self._newtons = np.array([rotor.newtons for rotor in rotors])  # of a control of 1
         self._qacc: np.ndarray | None = None  # bound by what first asks for it
-        unknown = dict.fromkeys(("position", "quaternion", "velocity", "body_rates", "touching"))
-        self.state = WorldState(command=self.acting, thrust=self.acting, **unknown)
         self.take()
         assert np.shares_memory(self.state.position, batch.state)
 
@@ -131,8 +129,10 @@ class MujocoWorld(World):
         if not scenery.varies:
             return
         if not scenery.given and (scenery.solids(0).kinds == HFIELD).any():
-            expected = "a scene with height fields to have given seeds on mujoco, as hills:0-7"
-            raise InputError(f"scene: expected {expected}, got {scenery.scene}")
+            raise InputError(
+                "scene: expected a scene with height fields to have given seeds on mujoco, "
+                f"as hills:0-7, got {scenery.scene}"
+            )
         for number, seed in enumerate(scenery.given):
             add_fields(spec, scenery.solids(seed), f"{number}")
 
@@ -334,8 +334,10 @@ class MujocoWorld(World):
             return pose.payload
         drones = self.shape[1]
         if drones != 1:
-            expected = "one drone in a world, or a task whose start places it"
-            raise InputError(f"effects.payload: expected {expected}, got {drones} drones")
+            raise InputError(
+                "effects.payload: expected one drone in a world, or a task whose start places it, "
+                f"got {drones} drones"
+            )
         return pose.position - (0.0, 0.0, self._cable)
 
     def _check_payload(self, mask: Array, hung: Array) -> None:
@@ -346,8 +348,10 @@ class MujocoWorld(World):
         least = self._cable + payload_radius(self._options.payload)
         low = mask & ~(height > least)
         if found(low):
-            expected = f"a height over {least:.4g} m, for the payload on its cable"
-            raise InputError(f"start: expected {expected}, got {height[low].min():.4g} m")
+            raise InputError(
+                f"start: expected a height over {least:.4g} m, for the payload on its cable, "
+                f"got {height[low].min():.4g} m"
+            )
 
     def _describe_warnings(self) -> str:
         counts = self._warnings[:, :, 1]
@@ -381,7 +385,7 @@ class WorldParameters:
         craft = owner >= 0
         hung = np.zeros(model.nbody, bool)
         if "payload" in drawn:
-            hung[payload_body(model)] = True
+            hung[model.body(PAYLOAD).id] = True
         # Of each craft the first of six degrees of freedom are those of its translation.
         linear = craft[model.dof_bodyid] & (np.arange(model.nv) % 6 < 3)
         torque = np.arange(6)[None] >= 3  # of a gear

@@ -19,7 +19,6 @@ from ..snapshots import Arrays
 from ..state import (
     Array,
     ByName,
-    WorldState,
     chosen,
     clip,
     found,
@@ -86,13 +85,10 @@ class RigidWorld(World):
             )
         self._body = RigidBody(vehicle)
         self._hull = Hull(vehicle)
-        thrust = self.acting
-        self._nobody = nobody = self.bad
+        self._nobody = self.bad
         self.slack: Array = np.zeros(shape, self.dtype) if scenery else None
-        moved = dict.fromkeys(("position", "quaternion", "velocity", "body_rates"))
-        self.state = WorldState(**moved, command=thrust, thrust=thrust, touching=nobody)
         if drones > 1:
-            self.state.colliding = nobody
+            self.state.colliding = self.bad
         self._show(np.tile(_LEVEL.astype(self.dtype), (*shape, 1)))
         self._advance = Kernel(self._advanced, shape) if compiled else self._advanced
 
@@ -250,7 +246,7 @@ def _check_forces(vehicle: Vehicle) -> None:
     theirs = np.concatenate((data.qpos, data.qvel)) - rows
     right = np.abs(ours - theirs).max() <= 1e-9 * max(1.0, np.abs(theirs).max())
     if not right:
-        expected = "RK4, and no forces but gravity, rotors and linear_drag"
         raise InputError(
-            f"vehicle: expected {expected} (the backend rigid), got others in {vehicle.name}"
+            "vehicle: expected RK4, and no forces but gravity, rotors and linear_drag (the backend "
+            f"rigid), got others in {vehicle.name}"
         )

@@ -16,21 +16,12 @@ import numpy as np
 
 from ...models.errors import one_line
 from .layout import Fields, Layout
-from .program import OPERATIONS, DType, Function, Program, Value
+from .program import OPERATIONS, TYPES, DType, Function, Program, Value
 
 Code = Callable[..., None]
 """Takes the number of blocks, the address of each memory, and that of the addresses of arrays
 outside, or None without any."""
 
-_KINDS = {
-    np.dtype(np.float32): "float",
-    np.dtype(np.float64): "double",
-    np.dtype(bool): "i1",
-    np.dtype(np.int32): "i32",
-    np.dtype(np.uint32): "i32",
-    np.dtype(np.int64): "i64",
-    np.dtype(np.uint64): "i64",
-}
 _SHORT = {"float": "f32", "double": "f64"}
 _MODULE = """define void @run(i64 %blocks{memories}, ptr %table) #0 {{
 {addresses}
@@ -68,6 +59,12 @@ end:
 {further}
 attributes #0 = {{ nounwind "min-legal-vector-width"="512" "prefer-vector-width"="512" }}
 """
+_BASE = """  %start.{0} = mul i64 %b, {1}
+  %base.{0} = getelementptr i8, ptr %"memory.{0}", i64 %start.{0}"""
+"""Lines that give the address of a block of a memory, by the memory's number and a block's size."""
+_ADDRESS = """  %place.{0} = getelementptr ptr, ptr %table, i64 {0}
+  %"out.{1}" = load ptr, ptr %place.{0}"""
+"""Lines that read the address of an array outside, by its number and name."""
 
 
 class Region(NamedTuple):
@@ -133,10 +130,7 @@ class _Printer:
         self._width = width
         self._bases = {name: i for i, one in enumerate(layouts) for name in one.fields}
         self._lines: list[str] = []
-        self._names: dict[int, str] = {}
-        self._calls: dict[str, str] = {}
         self._functions: dict[str, str] = {}
-        self._tables: list[np.ndarray] = []
         self._constants: dict[str, str] = {}
         self._count = 0
 
@@ -150,9 +144,9 @@ class _Printer:
         return _MODULE.format(
             memories="".join(f", ptr noalias %memory.{i}" for i in range(len(self._layouts))),
             outside="".join(f', ptr noalias %"out.{name}"' for name in self._outside),
-            addresses="\n".join(self._looked_up(i, one) for i, one in enumerate(self._outside)),
-            rows="\n".join(f"  {self._rows(name)} = alloca {self._size(name)}" for name in spread),
-            bases="\n".join(self._base(i, one.size) for i, one in enumerate(self._layouts)),
+            addresses="\n".join(_ADDRESS.format(i, one) for i, one in enumerate(self._outside)),
+            rows="\n".join(f'  %"rows.{name}" = alloca {self._size(name)}' for name in spread),
+            bases="\n".join(_BASE.format(i, one.size) for i, one in enumerate(self._layouts)),
             lanes=self._layouts[0].lanes,
             width=self._width,
             worlds=self._worlds(),
@@ -163,8 +157,8 @@ class _Printer:
 
     def _region(self, number: int, region: Region) -> None:
         after = f"%region.{number + 1}"
-        self._names = {}
-        self._calls = {}
+        self._names: dict[int, str] = {}
+        self._calls: dict[str, str] = {}
         self._tables = region.program.tables
         self._lines.append(f"region.{number}:")
         some = "true"
@@ -206,10 +200,10 @@ class _Printer:
         instruction: str = OPERATIONS[before.kind][operation].format(
             *inputs,
             kind=self._type(before),
-            lane=_KINDS[before],
-            lanes=self._suffix(_KINDS[before]),
+            lane=TYPES[before],
+            lanes=self._suffix(TYPES[before]),
             result=self._type(value.dtype),
-            to=self._suffix(_KINDS[value.dtype]),
+            to=self._suffix(TYPES[value.dtype]),
         )
         return self._new(instruction)
 
@@ -234,7 +228,7 @@ class _Printer:
         given = []
         for one in inputs:
             vector = f"{self._type(one.dtype)} {self._names[one.number]}"
-            given.append(f"{_KINDS[one.dtype]} {self._new(f'extractelement {vector}, i64 %l.{n}')}")
+            given.append(f"{TYPES[one.dtype]} {self._new(f'extractelement {vector}, i64 %l.{n}')}")
         result = self._new(f"call float inttoptr (i64 {address} to ptr)({', '.join(given)})")
         put = self._new(f"insertelement {lanes} %out.{n}, float {result}, i64 %l.{n}")
         self._lines += [
@@ -274,6 +268,7 @@ class _Printer:
         inner._lines = []
         inner._names = {}
         inner._calls = {}
+        inner._tables = function.program.tables
         for value in function.program.needed(function.results):
             inner._names[value.number] = inner._printed(value)
         kind = self._returned(function)
@@ -291,7 +286,7 @@ class _Printer:
         return f"<{self._width} x {kind}>"
 
     def _type(self, dtype: DType) -> str:
-        return self._lanes(_KINDS[dtype])
+        return self._lanes(TYPES[dtype])
 
     def _new(self, instruction: str) -> str:
         self._count += 1
@@ -301,7 +296,7 @@ class _Printer:
     def _number(self, value: Value) -> str:
         """A constant: LLVM reads floats as the bits of a double."""
         number = np.frombuffer(value.inputs[0], value.dtype)[0]
-        kind = _KINDS[value.dtype]
+        kind = TYPES[value.dtype]
         if value.dtype.kind != "f":
             return f"splat ({kind} {int(number)})"
         bits = int(np.float64(number).view(np.uint64))
@@ -317,7 +312,7 @@ class _Printer:
             kind = _in_memory(self._outside[array][0])
             start, index = f'%"out.{array}"', "%world"
             if self._is_spread(array):
-                start, index = self._rows(array), str(row * self._width)
+                start, index = f'%"rows.{array}"', str(row * self._width)
             return self._new(f"getelementptr {kind}, ptr {start}, i64 {index}"), kind, 1
         number = self._bases[array]
         layout = self._layouts[number]
@@ -348,20 +343,6 @@ class _Printer:
             value = self._new(f"zext {self._lanes('i1')} {value} to {self._lanes(kind)}")
         self._lines.append(f"  store {self._lanes(kind)} {value}, ptr {place}, align {align}")
 
-    def _base(self, number: int, size: int) -> str:
-        """Lines that give the address of a block of a memory."""
-        return (
-            f"  %start.{number} = mul i64 %b, {size}\n"
-            f'  %base.{number} = getelementptr i8, ptr %"memory.{number}", i64 %start.{number}'
-        )
-
-    def _looked_up(self, number: int, array: str) -> str:
-        """Lines that read the address of an array outside."""
-        return (
-            f"  %place.{number} = getelementptr ptr, ptr %table, i64 {number}\n"
-            f'  %"out.{array}" = load ptr, ptr %place.{number}'
-        )
-
     def _worlds(self) -> str:
         """Lines that number the worlds of these lanes."""
         lanes = self._lanes("i64")
@@ -376,10 +357,6 @@ class _Printer:
     def _is_spread(self, array: str) -> bool:
         """Whether a component of neighbours lies apart, as of an array outside with several."""
         return array in self._outside and prod(self._outside[array][1]) > 1
-
-    def _rows(self, array: str) -> str:
-        """Pointer to the components of an array that is spread, each for all lanes."""
-        return f'%"rows.{array}"'
 
     def _size(self, array: str) -> str:
         """The type of all of these components."""
@@ -400,7 +377,7 @@ class _Printer:
             f"  %l.{number} = phi i64 [0, %before.{number}], [%n.{number}, %turn.{number}]",
         ]
         world = self._new(f"add i64 %world, %l.{number}")
-        lanes = f"[{self._width} x {kind}], ptr {self._rows(array)}"
+        lanes = f'[{self._width} x {kind}], ptr %"rows.{array}"'
         components = f'[{prod(shape)} x {kind}], ptr %"out.{array}"'
         for row in rows:
             source = self._new(f"getelementptr {lanes}, i64 {row}, i64 %l.{number}")
@@ -433,7 +410,7 @@ class _Printer:
         """A column of a table, at rows that lie within it."""
         number, column, row = value.inputs
         table = self._tables[number]
-        kind = _KINDS[value.dtype]
+        kind = TYPES[value.dtype]
         array = f"[{table.shape[1]} x {kind}], ptr {self._constant(table)}"
         return self._gathered(array, kind, self._names[row.number], column)
 
@@ -451,7 +428,7 @@ def _cast(before: DType, after: DType) -> str:
 
 
 def _in_memory(dtype: DType) -> str:
-    return "i8" if dtype.kind == "b" else _KINDS[dtype]
+    return "i8" if dtype.kind == "b" else TYPES[dtype]
 
 
 @lru_cache

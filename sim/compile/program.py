@@ -15,6 +15,8 @@ from ...models.files import read_own_toml
 DType = np.dtype[Any]
 OPERATIONS = read_own_toml(__file__, "operations")
 """LLVM's instruction of each operation, by the kind of its first input, and its name."""
+TYPES = {np.dtype(name): text for name, text in OPERATIONS.pop("types").items()}
+"""LLVM's type of each dtype that can be compiled."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

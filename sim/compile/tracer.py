@@ -19,7 +19,7 @@ import numpy as np
 from numpy.lib.mixins import NDArrayOperatorsMixin
 from numpy.typing import DTypeLike
 
-from .program import OPERATIONS, DType, Function, Program, Value
+from .program import OPERATIONS, TYPES, DType, Function, Program, Value
 
 Call = Callable[..., Any]
 Traced = Any
@@ -27,7 +27,6 @@ Traced = Any
 
 _FLAG = np.dtype(bool)
 _WHOLE = np.dtype(np.int64)
-_DTYPES = ("bool", "int32", "uint32", "int64", "uint64", "float32", "float64")
 _EXPONENTS = (*range(-32, 0), *range(1, 33))
 _MOVES = (np.broadcast_to, np.expand_dims, np.moveaxis, np.repeat, np.flip)
 """Functions that move components, and compute nothing."""
@@ -111,8 +110,8 @@ class TracedArray(NDArrayOperatorsMixin):
         dtype = np.dtype(dtype)
         if dtype == self.dtype:
             return self.copy() if copy else self
-        if dtype.name not in _DTYPES:
-            _refuse(f"an array of {dtype}", f"take one of {', '.join(_DTYPES)}")
+        if dtype not in TYPES:
+            _refuse(f"an array of {dtype}", f"take one of {', '.join(map(str, TYPES))}")
         return self._each(partial(self.program.cast, dtype=dtype), dtype, self)
 
     def view(self, dtype: DTypeLike | None = None) -> "TracedArray":

@@ -13,7 +13,7 @@ from ... import models
 from ...models.errors import InputError, shortened
 from ..effects import NO_EFFECTS, EffectOptions
 from ..state import Array, WorldState, clip, total
-from .cascade import Attitude, Position, Rates, Velocity
+from .cascade import Attitude, Numbers, Position, Rates, Velocity
 from .gains import Gains, shared_ranges
 
 _CASCADE: Final[dict[str, type[Rates]]] = {
@@ -38,9 +38,9 @@ class Controller(Protocol):
     `EnvSpec`.
     """
 
-    low: tuple[float, ...]
+    low: Numbers
     """Lower bound of each number of an action, shape (k,)."""
-    high: tuple[float, ...]
+    high: Numbers
     """Upper bounds, shape (k,)."""
     components: tuple[str, ...]
     """Name of each number, or of each choice."""
@@ -67,8 +67,8 @@ class CollectiveThrust:
     def __init__(
         self, vehicle: "models.Vehicle", newtons: float, *, increment: bool, discrete: bool = False
     ) -> None:
-        self.low: tuple[float, ...] = (-1.0,)
-        self.high: tuple[float, ...] = (1.0,)
+        self.low: Numbers = (-1.0,)
+        self.high: Numbers = (1.0,)
         self.components: tuple[str, ...] = (
             ("decrease", "hold", "increase") if discrete else ("collective",)
         )
@@ -91,11 +91,12 @@ class CollectiveThrust:
 class RotorThrust:
     """One number for each rotor: 0 is its thrust at hover, -1 its least and 1 its largest."""
 
+    choices = 0
+
     def __init__(self, vehicle: "models.Vehicle") -> None:
         self.low = (-1.0,) * vehicle.num_rotors
         self.high = (1.0,) * vehicle.num_rotors
         self.components = tuple(f"F{i + 1}" for i in range(vehicle.num_rotors))
-        self.choices = 0
         self._hover = vehicle.hover_thrust
         self._up = vehicle.thrust_high - vehicle.hover_thrust
         self._down = vehicle.hover_thrust - vehicle.thrust_low

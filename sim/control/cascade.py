@@ -117,15 +117,13 @@ class Rates:
             now = parts_of(state.thrust)
             wanted = [old + lead * (new - old) for old, new in zip(now, wanted, strict=True)]
         commands = list(map(clip, wanted, self._low, self._high))
-        if self._throttle is not None:
+        table = self._throttle
+        if table is not None:
             both = zip(commands, self._high, strict=True)
-            commands = [high * self._throttle_of(part / high) for part, high in both]
+            commands = [
+                high * interpolated(table, _STEPS * square_root(part / high)) for part, high in both
+            ]
         return stack(commands)
-
-    def _throttle_of(self, share: Array) -> Array:
-        """Throttle at which a rotor gives a share of its largest thrust."""
-        assert self._throttle is not None
-        return interpolated(self._throttle, _STEPS * square_root(share))
 
     def _scaled(self, action: Array) -> list[Array]:
         pairs = zip(parts_of(action), self._sizes, strict=True)

@@ -99,7 +99,7 @@ class Gusts(Kept):
     def velocity(self) -> Vector:
         """Of the gust, world frame, m/s, three of shape (W, A)."""
         z = parts_of(self._state)
-        (x, y) = self._along
+        x, y = self._along
         root = math.sqrt(3)
         u = z[0]
         v, w = (root * z[i] + (1 - root) * z[i + 1] for i in (1, 3))

@@ -1,6 +1,5 @@
 """Which effects are on."""
 
-from dataclasses import fields
 from typing import Annotated
 
 from ...models import MAX_DRAG
@@ -56,12 +55,8 @@ class EffectOptions:
 
     def to_options(self) -> dict[str, object]:
         """Options by name that differ from their default."""
-        changed = {}
-        for one in fields(self):
-            value = getattr(self, one.name)
-            if value != one.default:
-                changed[one.name] = value
-        return changed
+        given = vars(self).items()
+        return {name: value for name, value in given if value != getattr(EffectOptions, name)}
 
 
 NO_EFFECTS = EffectOptions()

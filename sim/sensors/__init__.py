@@ -11,8 +11,8 @@ from collections.abc import Mapping
 from typing import Any, Final
 
 from ... import models
-from ...models.errors import InputError, shortened
-from ...models.fields import Choice, Flag, check, check_names
+from ...models.errors import InputError
+from ...models.fields import Choice, Flag, check, check_names, mapping
 from ..snapshots import Kept
 from ..state import Array, ByName, WorldState, chosen
 from ..world import World
@@ -34,26 +34,23 @@ _ESTIMATE = Estimator.about.name
 _OBSERVED = Choice(("added", _ESTIMATE))
 
 
-def checked_sensors(given: object) -> Settings:
+def checked_sensors(option: object) -> Settings:
     """The option `sensors` of a task as plain values in one order. Raises `InputError`.
 
     By sensor its settings by name, or True for none; False leaves it out. `estimate` is True or
     False, `observe` is "added" or "estimate".
     """
-    if not isinstance(given, Mapping):
-        raise InputError(f"sensors: expected settings by sensor, got {shortened(given)}")
-    check_names(given, [*SENSOR_TYPES, *range_sensors.KINDS, _ESTIMATE, "observe"], "sensors")
+    given = mapping(option, "sensors", "settings by sensor")
+    kinds = (*SENSOR_TYPES, *range_sensors.KINDS)
+    check_names(given, [*kinds, _ESTIMATE, "observe"], "sensors")
     sensors: Settings = {}
-    for name in (*SENSOR_TYPES, *range_sensors.KINDS):
+    for name in kinds:
         settings = given.get(name, False)
         if settings is False:
             continue
         if settings is True:
             settings = {}
-        if not isinstance(settings, Mapping):
-            raise InputError(
-                f"sensors.{name}: expected true, or settings by name, got {shortened(settings)}"
-            )
+        settings = mapping(settings, f"sensors.{name}", "true, or settings by name")
         if name in SENSOR_TYPES:
             sensors[name] = checked_settings(name, SENSOR_TYPES[name].about.settings, settings)
         else:
@@ -109,9 +106,10 @@ def range_sensors_of(
     sensors: Values, period: float, latest: int = 0, radius: float = 0.0
 ) -> list[range_sensors.RangeSensor]:
     """Sensors with rays, as of `RangeSensor`. Raises `InputError`."""
-    kinds = [kind for kind in range_sensors.KINDS if kind in sensors]
     return [
-        range_sensors.RangeSensor(kind, sensors[kind], period, latest, radius) for kind in kinds
+        range_sensors.RangeSensor(kind, sensors[kind], period, latest, radius)
+        for kind in range_sensors.KINDS
+        if kind in sensors
     ]
 
 

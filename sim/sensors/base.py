@@ -13,7 +13,7 @@ from ...models.coefficients import COEFFICIENTS
 from ...models.fields import Limits, Rule, check, check_names
 from ...models.files import read_own_toml
 from ..snapshots import Kept
-from ..state import Array, chosen, clip, some
+from ..state import Array, chosen, clip, filled, parts_of, pushed, some, stack
 from ..world import World
 
 MAX_DELAY = 1000  # Longest delay, control steps
@@ -110,7 +110,7 @@ class Sensor(Source):
     _held: Array = None
     """The last reading that was taken."""
     _readings: Array = None
-    """What is observed, with its flag, and those on their way: (W, A, k + 1, lag + 1)."""
+    """What is observed, with its flag, and those on their way: (W, A, lag + 1, k + 1)."""
 
     def __init__(self, values: Values, period: float, world: World) -> None:
         self.values = values
@@ -147,20 +147,20 @@ class Sensor(Source):
     @property
     def value(self) -> Array:
         """What is observed now, shape (W, A, k)."""
-        return self._readings[..., :-1, 0]
+        return self._readings[:, :, 0, :-1]
 
     @property
     def fresh(self) -> Array:
         """1 where it was not observed before, and 0 elsewhere, shape (W, A)."""
-        return self._readings[..., -1, 0]
+        return self._readings[:, :, 0, -1]
 
     def begin(self, mask: Array) -> None:
         """First reading of the drones of a mask."""
         self.draw(mask, self._noise.normal(mask)[..., :-1])
         first = self._read(self._noise.normal(mask))
         self._held = chosen(mask, first, self._held)
-        old = np.repeat(_flagged(first, 0.0), self.values["lag"], axis=-1)
-        readings = np.concat((_flagged(first, 1.0), old), axis=-1)
+        readings = filled(_flagged(first, 0.0), self.values["lag"] + 1)
+        readings[:, :, 0, -1] = 1.0
         self._readings = chosen(mask, readings, self._readings)
 
     def sample(self, mask: Array, steps: Array) -> None:
@@ -171,7 +171,7 @@ class Sensor(Source):
             normal = self._noise.normal(due)
             fresh = due & (normal[..., -1] >= self._lost)
             self._held = chosen(fresh, self._read(normal), self._held)
-        readings = np.concat((self._readings[..., 1:], _flagged(self._held, fresh)), axis=-1)
+        readings = pushed(self._readings, _flagged(self._held, fresh))
         self._readings = chosen(mask, readings, self._readings)
 
     def draw(self, mask: Array, normal: Array) -> None:
@@ -222,9 +222,5 @@ def _is_whole(steps: float) -> bool:
 
 
 def _flagged(reading: Array, fresh: Array) -> Array:
-    """A reading and its flag, shape (W, A, k + 1, 1)."""
-    *lead, size = reading.shape
-    both = np.empty_like(reading, np.float64, shape=(*lead, size + 1, 1))
-    both[..., :-1, 0] = reading
-    both[..., -1, 0] = fresh
-    return both
+    """A reading and its flag, shape (W, A, k + 1)."""
+    return stack((*parts_of(reading), fresh))

@@ -76,8 +76,10 @@ class RangeSensor(Instrument):
         where = f"sensors.{kind}"
         most = values["max_rate"]
         if (values["rate"] or 0.0) > most:
-            expected = f"at most {most:g} Hz of a {values['model']}"
-            raise InputError(f"{where}.rate: expected {expected}, got {values['rate']:g} Hz")
+            raise InputError(
+                f"{where}.rate: expected at most {most:g} Hz of a {values['model']}, "
+                f"got {values['rate']:g} Hz"
+            )
         every, lag = sampling(where, values["rate"], values["delay"], period)
         if values["rate"] is None:
             every = max(1, math.ceil(1 / (most * period) - 1e-6))
@@ -195,12 +197,13 @@ def _rays_of(kind: str, values: Values) -> Rays:
     """In the sensor's frame."""
     if "directions" in values:
         return Rays([values["directions"]])
-    if kind == "lidar":
-        if values["low"] > values["high"]:
-            got = f"{values['low']:g} and {values['high']:g}"
-            raise InputError(f"sensors.lidar: expected low <= high, got {got} degrees")
-        return Rays.rings(*(values[name] for name in _PATTERNS[kind]))
-    return Rays.pinhole(*(values[name] for name in _PATTERNS[kind]))
+    if kind == "lidar" and values["low"] > values["high"]:
+        raise InputError(
+            "sensors.lidar: expected low <= high, "
+            f"got {values['low']:g} and {values['high']:g} degrees"
+        )
+    pattern = [values[name] for name in _PATTERNS[kind]]
+    return Rays.rings(*pattern) if kind == "lidar" else Rays.pinhole(*pattern)
 
 
 def _turn(yaw: float, pitch: float) -> np.ndarray:

@@ -46,7 +46,7 @@ def started(env: LocalVectorEnv, start: dict[str, Any]) -> Snapshot:
     """The snapshot of an env at other starts."""
     snapshot = env.snapshot()
     parts = [np.array(start[name]) for name in MOTION]
-    snapshot["Flight/state/motion"] = np.concatenate(parts, axis=-1)
+    snapshot["Flight/motion"] = np.concatenate(parts, axis=-1)
     for name in ("position", "behind"):
         if f"record/memory/{name}" in snapshot:
             snapshot[f"record/memory/{name}"] = parts[0]

@@ -234,6 +234,15 @@ def test_rows_of_a_table(dtype: str) -> None:
     check("looked_up(TABLE[:, 1], x) + 1.0", x)
 
 
+def test_a_function_that_is_there_once_reads_its_own_table() -> None:
+    first = np.array([10.0, 20.0])
+    second = np.array([3.0, 5.0])
+    own = once()(lambda x: looked_up(second, x))
+    x = {"x": np.array([0.0, 1.0, 1.0])}
+    found = outputs(lambda x: looked_up(first, x) + own(x), x)
+    assert found.ravel().tolist() == [13.0, 25.0, 25.0]
+
+
 def test_a_table_that_changes_later_does_not_change_the_code() -> None:
     x = {"x": np.arange(3.0)}
     table = np.array([3.0, 4.0, 5.0])
