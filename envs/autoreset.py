@@ -26,6 +26,9 @@ Content = tuple[Mapping[str, Array], Mapping[str, Array]]
 """Telemetry and terms of the reward by name, float64, shape (N, n) and (N,)."""
 Told = Callable[[], Content]
 Seeds = Sequence[int | None] | Array
+"""A seed for each drone; None leaves its stream of random numbers as it is."""
+Seed = int | Seeds | None
+"""As of a reset: drone i gets seed + i, or the i-th of N seeds; None leaves their streams."""
 
 
 class AdvancingVectorEnv(VectorEnv[Observation, ArrayLike, Array]):
@@ -56,6 +59,7 @@ class AdvancingVectorEnv(VectorEnv[Observation, ArrayLike, Array]):
     out: Array
     lost: Array
     telemetry: Mapping[str, Array]
+    _nothing: Array = np.zeros(1)  # actions, where nobody flies
 
     @property
     def headline(self) -> Array:
@@ -70,9 +74,7 @@ class AdvancingVectorEnv(VectorEnv[Observation, ArrayLike, Array]):
         return mode
 
     @abstractmethod
-    def reset(
-        self, *, seed: int | Seeds | None = None, options: Info | None = None
-    ) -> tuple[Observation, Info]:
+    def reset(self, *, seed: Seed = None, options: Info | None = None) -> tuple[Observation, Info]:
         """Begin an episode, for all drones or some."""
 
     @abstractmethod
@@ -80,7 +82,7 @@ class AdvancingVectorEnv(VectorEnv[Observation, ArrayLike, Array]):
         self,
         actions: ArrayLike,
         resets: Array | None = None,
-        seeds: Seeds | None = None,
+        seeds: Seed = None,
         frozen: Array | None = None,
     ) -> None:
         """Reset some drones, freeze some, and fly the others for one control period.
@@ -89,8 +91,7 @@ class AdvancingVectorEnv(VectorEnv[Observation, ArrayLike, Array]):
         that is frozen is afterwards as it was before. Drones of one world are reset and frozen
         together; one that is out gets no reward while the others fly on. Actions have shape (N, k),
         discrete ones (N,) or (N, 1); masks are bool, shape (N,), or None; a drone of both masks is
-        reset. Seeds, shape (N,), are of those that are reset; None leaves their streams as they
-        are.
+        reset. Seeds, as of `reset`, are of those that are reset.
         """
 
     def step(self, actions: ArrayLike) -> Step:
@@ -119,11 +120,7 @@ class AdvancingVectorEnv(VectorEnv[Observation, ArrayLike, Array]):
         self._nobody = np.zeros(num_envs, bool)
         self._everybody = np.ones(num_envs, bool)
         self.control_period = spec.control_period
-        fps = max(1, round(1 / spec.control_period))
-        self.metadata = {"render_modes": [], "render_fps": fps, "autoreset_mode": mode}
-
-    def _no_actions(self) -> Array:
-        return np.zeros(self.action_space.shape or (), np.float32)
+        self.metadata = {"render_modes": [], "render_fps": spec.fps, "autoreset_mode": mode}
 
     def _begin_next(
         self, rewards: Array, terminated: Array, truncated: Array, last: Info
@@ -138,7 +135,7 @@ class AdvancingVectorEnv(VectorEnv[Observation, ArrayLike, Array]):
         while some(self.done):
             truncated = truncated | self.lost
             ended = ended | self.done
-            self.advance(self._no_actions(), self.done, None, ~self.done)
+            self.advance(self._nothing, self.done, None, ~self.done)
         masks = {name: mask & ended for name, mask in last.items() if name.startswith("_")}
         info = self._info(self._everybody)
         info |= {"final_obs": observations, "_final_obs": ended}
@@ -170,12 +167,11 @@ class AdvancingVectorEnv(VectorEnv[Observation, ArrayLike, Array]):
         return lambda: (telemetry, {})
 
 
-def worlds_done(out: Any, drones: int) -> Any:
+def worlds_done(out: Array, drones: int) -> Array:
     """Drones whose whole world is out; `out` is bool, shape (N,)."""
     if drones == 1 or not out.any():
         return out
-    all_out = out.reshape(-1, drones).all(-1)
-    return (all_out[:, None] & out.reshape(-1, drones)).reshape(out.shape)
+    return np.repeat(out.reshape(-1, drones).all(-1), drones)
 
 
 def checked_mode(mode: AutoresetMode | str) -> AutoresetMode:

@@ -59,7 +59,7 @@ class CompiledLoop(Loop):
         sent = record.sent if flies else None
         flew = record.flown
         if seeds is not None:
-            seeds = seeds[:: len(self.spec.agents)]
+            seeds = seeds[:: self.config.drones]
         try:
             if flies and self._world.scenery.moves:
                 steps = machine.memory.get("record/kept/steps")
@@ -98,10 +98,9 @@ class CompiledLoop(Loop):
         config = self.config
         loop = Loop(replace(config, backend=replace(config.backend, compiled=False)))
         loop.measures = False
-        neutral = loop.pipeline.actions.neutral()
         try:
-            _begin(loop, neutral)
-            loop.advance(neutral)
+            _begin(loop)
+            loop.advance(loop.pipeline.actions.neutral())
             return Machine(loop, self._world)
         except InputError as error:  # which NumPy will raise
             self.refusal = str(error)
@@ -163,12 +162,12 @@ class CompiledLoop(Loop):
         self._refuse_stuck()
 
 
-def _begin(loop: Loop, actions: Array) -> None:
+def _begin(loop: Loop) -> None:
     """Begin an episode. Raises `InputError` if many starts are refused."""
     everybody = np.ones(loop.num_envs, bool)
     for seed in range(_STARTS):
         try:
-            loop.advance(actions, everybody, [seed] * loop.num_envs)
+            loop.advance(None, everybody, [seed] * loop.num_envs)
         except InputError as error:
             refused = error
         else:

@@ -75,9 +75,8 @@ class BackendConfig:
     @property
     def settings(self) -> Values:
         """Settings that are not None, as keyword arguments of `sim.make_world`."""
-        values = {name: value for name, value in asdict(self).items() if value is not None}
-        del values["name"]
-        return values
+        values = {name: getattr(self, name) for name in BACKEND_KEYWORDS}
+        return {name: value for name, value in values.items() if value is not None}
 
 
 @immutable
@@ -131,15 +130,16 @@ class EnvConfig:
 
     def __post_init__(self) -> None:
         check_fields(self)
-        env_id = canonical_id(self.env_id)
-        defaults = registry.task_type(env_id).defaults if registry.is_known(env_id) else {}
-        if self.sensors is None:
-            set_fields(self, sensors=defaults.get("sensors", {}))
-        if not self.vehicle:
-            set_fields(self, vehicle=defaults.get("vehicle", ()))
+        set_fields(self, env_id=canonical_id(self.env_id), vehicle=self.vehicle or ())
+        task = registry.task_type(self.env_id) if registry.is_known(self.env_id) else None
+        defaults: Values = {"sensors": {}}
+        if task:
+            defaults |= {name: getattr(task, name) for name in _FROM_TASK}
+            defaults |= task.defaults
+        missing = [name for name in defaults if getattr(self, name) in (None, ())]
+        set_fields(self, **{name: defaults[name] for name in missing})
         set_fields(
             self,
-            env_id=env_id,
             backend=BackendConfig.parse(self.backend),
             vehicle=vehicle_words(self.vehicle),
             cameras=words_of("cameras", self.cameras),
@@ -157,10 +157,7 @@ class EnvConfig:
             set_fields(self, effects=read_table(EffectOptions, self.effects, "effects"))
         options: Options = mapping(self.task, "task", "options by name")
         usual = SceneConfig()
-        if registry.is_known(self.env_id):
-            task = registry.task_type(self.env_id)
-            defaults = {name: getattr(task, name) for name in _FROM_TASK}
-            set_fields(self, **{k: v for k, v in defaults.items() if getattr(self, k) is None})
+        if task:
             check("action", Choice(task.actions), self.action)
             chosen = task.Options.from_options(options, KEYWORDS)
             options = chosen.to_options()
@@ -241,10 +238,9 @@ class EnvConfig:
 
     def to_dict(self) -> Values:
         """All fields as JSON values, with the version."""
-        content = {one.name: getattr(self, one.name) for one in fields(self)}
-        content |= {"effects": self.effects.to_options()}
+        content = {"version": VERSION, **vars(self), "effects": self.effects.to_options()}
         content |= {"scene": asdict(self.scene), "backend": asdict(self.backend)}
-        return json_values({"version": VERSION, **content})
+        return json_values(content)
 
     @classmethod
     def from_dict(cls, content: object) -> Self:
@@ -276,6 +272,11 @@ class EnvConfig:
     def estimated(self) -> bool:
         """Whether controller and observation get the onboard estimate, once a control step."""
         return self.sensors.get("observe") == "estimate"
+
+    @property
+    def drawn(self) -> Randomization:
+        """What is drawn for each episode. Raises `InputError` where its effect is off."""
+        return Randomization(self.randomize, self.effects)
 
     @property
     def vehicle_paths(self) -> tuple[str, ...]:
@@ -365,8 +366,7 @@ class EnvConfig:
             content.pop("scene")
         for name in ("num_threads", "compiled"):
             content["backend"].pop(name)
-        text = json.dumps(content, sort_keys=True, separators=(",", ":"))
-        return blake2b(text.encode(), digest_size=16).hexdigest()
+        return _hash_of(json.dumps(content, sort_keys=True, separators=(",", ":")))
 
 
 _FROM_TASK = ("action", "control_period", "episode_length")
@@ -393,32 +393,36 @@ def read_keywords(path: Path | str) -> Values:
         raise InputError(f"config: cannot read {file}: {error.strerror}") from None
     if "vehicle" in content:
         words = vehicle_words(content["vehicle"])
-        beside = [file.parent / word for word in words]
-        content["vehicle"] = tuple(
-            str(near) if near.is_file() else word for near, word in zip(beside, words, strict=True)
-        )
-    scene = content.get("scene")
+        content["vehicle"] = tuple(_beside(file, word) for word in words)
+    scene = content.get("scene", "")
     if is_scene_file(scene):
-        near = file.parent / str(scene)
-        content["scene"] = str(near if near.is_file() else scene)
+        content["scene"] = _beside(file, scene)
     return content
+
+
+def _beside(file: Path, word: str) -> str:
+    """The path of a file beside another, or the word where there is none."""
+    near = file.parent / word
+    return str(near) if near.is_file() else word
 
 
 def source_hash(task: type, draw: object = None) -> str:
     """Hash of the source of a task, its bases and what draws its scene; empty if all are ours."""
-    digest = blake2b(digest_size=16)
-    found = False
+    sources = ""
     for part in (*task.__mro__, draw):
         module = getattr(part, "__module__", "builtins")
         if module.partition(".")[0] in ("rotorgram", "abc", "builtins"):
             continue
         try:
-            source = inspect.getsource(sys.modules[module])
+            sources += inspect.getsource(sys.modules[module])
         except (OSError, TypeError, KeyError):
-            source = getattr(part, "__qualname__", module)  # typed into an interpreter
-        digest.update(source.encode())
-        found = True
-    return digest.hexdigest() if found else ""
+            sources += getattr(part, "__qualname__", module)  # typed into an interpreter
+    return _hash_of(sources) if sources else ""
+
+
+def _hash_of(text: str) -> str:
+    """32 hexadecimal digits."""
+    return blake2b(text.encode(), digest_size=16).hexdigest()
 
 
 def words_of(name: str, given: object) -> tuple[str, ...]:

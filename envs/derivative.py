@@ -6,9 +6,10 @@ import numpy as np
 
 from ..sim.compile import Program, lift, read
 from ..sim.compile.adjoint import adjoints
-from ..sim.compile.layout import Layout, Memory, fields_of
+from ..sim.compile.layout import Fields, Layout, Memory, fields_of
 from ..sim.compile.llvm import Region, compiled
 from ..sim.scenery import Frozen
+from ..sim.snapshots import part_of
 from ..sim.state import Array, ByName
 from .loop import Loop
 
@@ -42,11 +43,12 @@ class Derivative:
 
     def __init__(self, loop: Loop, state: Layout, width: int, worlds: int) -> None:
         program = Program()
-        before = _variables(program, loop, state)
+        sent = loop.record.sent
+        shared = fields_of({**loop.world.scenery.shared(), "sent": sent})
+        before = variables(program, loop, {**state.fields, **shared})
         after = _flown(loop, before)
         ended = read(program, "ended", np.dtype(bool), (1,))
-        arrays: ByName = {"sent": before["sent"], "ended": ended}
-        arrays |= {name: before[name] for name in loop.world.scenery.shared()}
+        arrays: ByName = {"ended": ended} | {name: before[name] for name in shared}
         outputs: list[Any] = []
         inputs: list[Any] = []
         places = []
@@ -99,18 +101,16 @@ class Derivative:
         return memory.get("by/sent").reshape(sent.shape)
 
 
-def _variables(program: Program, loop: Loop, state: Layout) -> ByName:
-    """Variables of a state, which becomes the loop's, and of actions."""
-    arrays: ByName = {}
-    scenery = loop.world.scenery
-    shared = fields_of(scenery.shared())
-    for name, (dtype, shape) in {**state.fields, **shared}.items():
-        arrays[name] = read(program, name, dtype, (1, *shape))
-    for name in shared:
-        setattr(scenery, name, arrays[name])
-    sent = loop.record.sent
+def variables(program: Program, loop: Loop, fields: Fields) -> ByName:
+    """Variables of a loop's state, its scenery and more; the loop has them from now on."""
+    arrays: ByName = {
+        name: read(program, name, dtype, (1, *shape)) for name, (dtype, shape) in fields.items()
+    }
+    world = loop.world
+    world.outer = part_of(arrays, "physics")
+    for name in world.scenery.shared():
+        setattr(world.scenery, name, arrays[name])
     loop.put(arrays)
-    arrays["sent"] = read(program, "sent", sent.dtype, sent.shape)
     return arrays
 
 

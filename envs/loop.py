@@ -12,11 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..models.errors import InputError
-from ..sim import Array, PhysicsError, Randomization, World, make_world
+from ..sim import Array, PhysicsError, World, make_world
 from ..sim.sensors.instruments import Moment
 from ..sim.snapshots import Arrays, Snapshot, joined, part_of
 from ..sim.state import ByName, found, is_traced, some
-from .autoreset import Content, Seeds, Told, checked_seeds
+from .autoreset import Content, Seed, Seeds, Told, checked_seeds
 from .config import EnvConfig
 from .pipeline import Pipeline
 from .specification import instruments_of, make_task, spec_of
@@ -74,13 +74,13 @@ class Loop:
             backend.name,
             drones=config.drones,
             effects=flown.effects,
-            randomize=Randomization(flown.randomize, flown.effects),
+            randomize=flown.drawn,
             scene=flown.scene,
             **backend.settings,
         )
-        self.pipeline = pipeline = Pipeline(task, world, shape)
+        self.pipeline = pipeline = Pipeline(task, world)
         self.spec = spec_of(config, task)
-        self.instruments = instruments_of(task, shape)
+        self.instruments = instruments_of(task)
         self.measures = bool(self.instruments)
         later = {name for instrument in self.instruments for name in instrument.every}
         self.arrays = [array for array in self.spec.observation if array.name not in later]
@@ -101,7 +101,7 @@ class Loop:
         self,
         actions: Array,
         resets: Array | None = None,
-        seeds: Seeds | None = None,
+        seeds: Seed = None,
         frozen: Array | None = None,
     ) -> None:
         """Reset some drones, freeze some, and fly the others for one control period.
@@ -113,11 +113,10 @@ class Loop:
         record = self._record
         clock.take(record, resets, frozen)
         flies = some(record.flown)
-        if record.begun is not None:
-            seeds = checked_seeds(seeds, self.num_envs)
+        wanted = None if record.begun is None else checked_seeds(seeds, self.num_envs)
         if flies:
             record.sent = self.pipeline.actions.checked(actions, record.flown)
-        self._step(seeds, flies=flies)
+        self._step(wanted, flies=flies)
 
     def _step(self, seeds: Seeds | None, *, flies: bool) -> None:
         """Run the regions for the masks of the record."""
@@ -180,7 +179,7 @@ class Loop:
         if not record.has_begun and not all_begin:
             record.begin_all(begin)
         if seeds is not None:
-            self._world.random.seed(begun, seeds[:: len(self.spec.agents)])
+            self._world.random.seed(begun, seeds[:: self.config.drones])
         record.run(None if all_begin else begun, begin)
 
     def _measure(self) -> None:
@@ -275,8 +274,7 @@ class Loop:
                 self._move_solids(record.steps)  # before what measures distances
 
     def __reduce__(self) -> Any:
-        worlds = self.num_envs // self.config.drones
-        return type(self), (self.config, worlds), self.snapshot()
+        return type(self), (self.config, self._record.shape[0]), self.snapshot()
 
     __setstate__ = restore
 
@@ -286,15 +284,12 @@ class Loop:
         count = self.num_envs
         self._take_told(None)
         self._headline: Floats | None = None
-        known = vars(record).get("observations")
+        known = vars(record).get("observations", {})
         self.observations = {}
-        for array in self.arrays if known is not None else self.spec.observation:
-            shape = (count, *array.shape)
-            if known is None:  # before an episode
-                self.observations[array.name] = np.zeros(shape, array.dtype)
-            else:
-                values = np.array(known[array.name], array.dtype)
-                self.observations[array.name] = values.reshape(shape)
+        for array in self.arrays if known else self.spec.observation:
+            nothing = np.zeros((*record.shape, *array.shape))  # before an episode
+            values = np.array(known.get(array.name, nothing), array.dtype)
+            self.observations[array.name] = values.reshape(count, *array.shape)
         self.rewards = np.array(record.reward).reshape(count)
         self.terminated = np.array(record.terminated).reshape(count)
         self.truncated = np.array(record.truncated).reshape(count)
@@ -376,8 +371,7 @@ class Loop:
     def close(self) -> None:
         """Release threads and memory; what the last step gave can be read on."""
         self._settle()
-        for stage in self.pipeline.stages:
-            stage.close()
+        self._world.close()
         for instrument in self.instruments:
             instrument.close()
         self._closed = True

@@ -14,14 +14,14 @@ import numpy as np
 
 from ..models.errors import InputError
 from ..sim import World
-from ..sim.compile import Program, Untraceable, lift, read
+from ..sim.compile import Program, Untraceable, lift
 from ..sim.compile.layout import Layout, Memory, fields_of
 from ..sim.compile.llvm import Region, compiled, widest
 from ..sim.snapshots import Arrays, Snapshot, joined, part_of
 from ..sim.state import ByName
 from ..sim.world import Call
 from .autoreset import Array, Seeds, Told
-from .derivative import Before, Derivative
+from .derivative import Before, Derivative, variables
 from .loop import Loop
 from .stages.record import Mask, Record
 from .telemetry import telemetry_of
@@ -103,21 +103,25 @@ class Machine:
         """What is compiled, by name: a whole step, or what comes before and after physics."""
         loop = self._loop
         pipeline = loop.pipeline
-        last = [self._traced("active", pipeline.observe), self._looked()]
+        last = [
+            self._traced("active", pipeline.observe),
+            self._gives(lambda: self._seen() | self._telemetry()),
+        ]
         if self.is_whole:
             first = [self._traced("", [Record.rest]), self._traced("flown", pipeline.fly)]
             return {_LAST: [*first, self._traced("begun", pipeline.begin), *last]}
         flight = pipeline.flight
         take = self._traced("", [Record.rest, flight.take])
         regions = {
-            _FIRST: [self._traced("flown", pipeline.before), self._pushing()],
+            _FIRST: [self._traced("flown", pipeline.before), self._gives(self._pushed)],
             _BEGIN: [self._traced("begun", pipeline.set_out)],
             _LAST: [take, self._traced("begun", pipeline.sense), *last],
         }
         for code, call in self._calls:
             if code and code not in regions:
                 stage = flight.control if call.commands else flight.push
-                regions[code] = [take, self._traced("flown", [stage]), self._pushing()]
+                flown = self._traced("flown", [stage])
+                regions[code] = [take, flown, self._gives(self._pushed)]
         return regions
 
     def _plan(self, given: Named) -> None:
@@ -307,28 +311,12 @@ class Machine:
         pushed = {"acting": world.acting, "wrench": world.wrench}
         return {name: array for name, array in pushed.items() if array is not None}
 
-    def _pushing(self) -> Region:
-        """What the physics gets."""
-        return self._gives(self._pushed)
-
     def _variables(self, program: Program) -> Named:
         """Variables of all arrays; those of the state become the loop's."""
-        given = {**self._layouts[0].fields, **self._outside}
-        arrays: Named = {
-            name: read(program, name, dtype, (1, *shape)) for name, (dtype, shape) in given.items()
-        }
+        arrays = variables(program, self._loop, {**self._layouts[0].fields, **self._outside})
         for name in _MASKS:  # alike for the drones of a world
             first = arrays[name][:, :1]
             arrays[name] = np.repeat(first, self._world.shape[1], axis=1)
-        self._loop.world.outer = {
-            name.removeprefix(_PHYSICS): values
-            for name, values in arrays.items()
-            if name.startswith(_PHYSICS)
-        }
-        scenery = self._loop.world.scenery
-        for name in self._world.scenery.shared():
-            setattr(scenery, name, arrays[name])
-        self._loop.put({name: arrays[name] for name in self._names})
         return arrays
 
     def _traced(self, mask: str, stages: Step) -> Region:
@@ -341,10 +329,6 @@ class Machine:
         record.sent = before["sent"]
         record.run(before.get(mask), stages)
         return Region(mask, program, _stores(program, self._loop.state(), before))
-
-    def _looked(self) -> Region:
-        """What leaves the loop, and what is told of it."""
-        return self._gives(lambda: self._seen() | self._telemetry())
 
     def _gives(self, named: Callable[[], Named]) -> Region:
         """A region that writes arrays."""

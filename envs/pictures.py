@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from ..models.cameras import FARTHEST, View, chosen_views
-from ..scenes import SceneConfig
 from ..sim.sensors.instruments import Instrument, Moment
 from ..sim.state import ByName
 from .spec import PICTURE, ArraySpec
@@ -64,20 +63,18 @@ class Pictures(Instrument):
     Threads draw its worlds, as many as there are cores; a world's pictures do not depend on them.
 
     Args:
-        task: Its options choose the cameras.
-        scene: Of the world.
-        shape: (W, A).
-        latest: As of `Instrument`.
+        task: Its config chooses the cameras.
     """
 
-    def __init__(self, task: Task, scene: SceneConfig, shape: tuple[int, int], latest: int) -> None:
+    def __init__(self, task: Task) -> None:
         from ..rendering.cameras import Cameras
 
         self.views = chosen_views(task.config.cameras, task.vehicle.cameras)
-        super().__init__({view.name: view.camera.every for view in self.views}, 0, latest)
-        self._shape = shape
+        every = {view.name: view.camera.every for view in self.views}
+        super().__init__(every, 0, task.config.drawn.most_steps("observation_delay"))
+        self._shape = shape = task.shape
         self._period = task.control_period
-        scenes = scene.given_scenes
+        scenes = task.config.scene.given_scenes
         threads = min(os.cpu_count() or 1, shape[0], _MAX_THREADS)
         # It starts them with the first picture, so that a process may be forked before.
         self._pool = ThreadPoolExecutor(threads, "cameras")

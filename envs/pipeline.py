@@ -35,12 +35,7 @@ class Pipeline:
         set_out, sense: `begin` before the physics, and after it.
     """
 
-    def __init__(
-        self,
-        task: Task,
-        world: World,
-        shape: tuple[int, int],
-    ) -> None:
+    def __init__(self, task: Task, world: World) -> None:
         config = task.config
         controller = task.controller
         period = task.control_period
@@ -60,7 +55,7 @@ class Pipeline:
         often = getattr(controller, "every_step", False) and not config.estimated
         held = 1 if often else substeps
         parts: list[Stage] = [Control(controller, look)]
-        if shape[1] > 1:
+        if world.shape[1] > 1:
             vehicle = task.vehicle
             parts.append(StandStill(np.clip(0.0, vehicle.thrust_low, vehicle.thrust_high)))
 
@@ -75,8 +70,7 @@ class Pipeline:
             longest = randomize.most_steps("observation_delay")
             observing.append(ObservationDelay(world, longest))
         if config.history > 1:
-            names = [array.name for array in observed(task)]
-            observing.append(History(config.history, names))
+            observing.append(History(config.history))
         observing.append(Ends(config.env_id, task.episode_length))
 
         self.stages = [Starts(task, world), *flying, *observing]

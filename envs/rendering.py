@@ -56,7 +56,7 @@ class Renderer:
             return None
         from ..rendering import Canvas
 
-        drones = len(self._loop.spec.agents)
+        drones = self._loop.config.drones
         one = len(now) == drones
         size = (480, 360) if one else (240, 180)
         pictures = []
@@ -72,7 +72,7 @@ class Renderer:
     def _show(self, now: "list[Moment]") -> None:
         from ..rendering import live
 
-        shown = now[: len(self._loop.spec.agents)]  # of the first world
+        shown = now[: self._loop.config.drones]  # of the first world
         scene = self._scene(0)
         if self._view is None:
             pace = live.Pace(self._loop.spec.control_period)
@@ -94,7 +94,7 @@ class Renderer:
         """Of a world."""
         from ..rendering import Stage
 
-        drones = len(self._loop.spec.agents)
+        drones = self._loop.config.drones
         crafts = members_of(self._loop.vehicle, drones)
         return Stage(scene, drones, vehicle=[str(one.path) for one in crafts], trail=trail)
 
@@ -144,16 +144,13 @@ def moment(spec: EnvSpec, telemetry: Mapping[str, Any], *, step: int = 0, **rest
     for name in ("position", "attitude", "thrust", "metrics", "goal", "payload"):
         if name in telemetry:
             numbers[name] = tuple(np.asarray(telemetry[name], float).tolist())
+    thrusts = numbers.pop("thrust")
     metrics = []
-    if spec.metrics:
-        for metric, value in zip(spec.metrics, numbers["metrics"], strict=True):
-            metrics.append(MetricValue(metric.name, value, metric.unit, metric.symbol))
+    for metric, value in zip(spec.metrics, numbers.pop("metrics", ()), strict=False):
+        metrics.append(MetricValue(metric.name, value, metric.unit, metric.symbol))
     return Moment(
-        position=numbers["position"],
-        attitude=numbers["attitude"],
-        thrusts=numbers["thrust"],
-        goal=numbers.get("goal"),
-        payload=numbers.get("payload"),
+        **numbers,
+        thrusts=thrusts,
         metrics=tuple(metrics),
         marks=spec.marks,
         time=spec.control_period * step,

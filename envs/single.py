@@ -55,12 +55,11 @@ class SingleEnv(gym.Env[Observation, ArrayLike]):
         self._renderer = Renderer(render_mode, loop)
         self.env_spec = loop.spec
         self.control_period = loop.spec.control_period
-        self.metadata = self.metadata | {"render_fps": max(1, round(1 / self.control_period))}
+        self.metadata = self.metadata | {"render_fps": loop.spec.fps}
         self.observation_space = observation_space(loop.spec)
         self.action_space = action_space(loop.spec)
         self._names = telemetry_names(loop.spec)
         self._all = np.ones(1, bool)
-        self._no_action = np.zeros((1, len(loop.task.controller.low)), np.float32)
 
     def reset(
         self, *, seed: int | None = None, options: Info | None = None
@@ -69,7 +68,7 @@ class SingleEnv(gym.Env[Observation, ArrayLike]):
         if options:
             raise InputError(f"reset: expected no options, got {options!r}")
         super().reset(seed=seed)
-        self._loop.advance(self._no_action, self._all, None if seed is None else [seed])
+        self._loop.advance(None, self._all, seed)
         if self.render_mode == "human":
             self.render()
         return self._observation(), self._info()

@@ -9,12 +9,21 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import MISSING, field, fields, replace
 from numbers import Real
-from typing import Annotated, Any, ClassVar, Final, Literal, Self
+from typing import Annotated, Any, Literal, Self
 
 import numpy as np
 
 from ..models.errors import InputError, shortened
-from ..models.fields import Choice, Limits, Text, check, check_fields, immutable, printable
+from ..models.fields import (
+    Choice,
+    Limits,
+    Text,
+    check,
+    check_fields,
+    immutable,
+    printable,
+    set_fields,
+)
 from ..scenes import marks
 
 MAX_ELEMENTS = 1 << 22  # numbers of all observations of one drone
@@ -65,7 +74,7 @@ _SIZE = Limits(0.0, above=True)
 class _Part:
     """A dataclass that is a JSON object: tuples are lists, infinity is null."""
 
-    _optional: ClassVar[tuple[str, ...]] = ()
+    _optional: tuple[str, ...] = ()
     """Fields that are left out where they have their default."""
 
     def _to_content(self) -> dict[str, object]:
@@ -132,8 +141,7 @@ class ArraySpec(_Part):
         _expect(is_shape, name, "a shape of whole numbers >= 1", shape)
         _expect(len(shape) <= MAX_DIMENSIONS, name, f"at most {MAX_DIMENSIONS} axes", len(shape))
         _expect(self.size <= MAX_ELEMENTS, name, f"at most {MAX_ELEMENTS} elements", shape)
-        object.__setattr__(self, "low", self._bound("low", -math.inf))
-        object.__setattr__(self, "high", self._bound("high", math.inf))
+        set_fields(self, low=self._bound("low", -math.inf), high=self._bound("high", math.inf))
         low, high = self.bounds()
         wrong = ~((low <= high) & (low < np.inf) & (high > -np.inf))
         if wrong.any():
@@ -257,8 +265,8 @@ class EnvSpec(_Part):
 
     def __post_init__(self) -> None:
         check_fields(self, "", SpecError)
-        object.__setattr__(self, "options", json_values(self.options))
-        object.__setattr__(self, "constants", _checked_constants(self.constants))
+        options = json_values(self.options)
+        set_fields(self, options=options, constants=_checked_constants(self.constants))
         _check_different("agents", self.agents, MAX_AGENTS)
         _expect(self.agents, "agents", "at least one name", self.agents)
         hidden = [array.privileged for array in self.observation]
@@ -295,6 +303,11 @@ class EnvSpec(_Part):
         scale = self.constants.get("action_scale", 1.0)
         size = 1 if isinstance(self.action, Discrete) else self.action.size
         return np.broadcast_to(np.asarray(scale, np.float64), size)
+
+    @property
+    def fps(self) -> int:
+        """Steps per second, rounded, at least 1: of films."""
+        return max(1, round(1 / self.control_period))
 
     @property
     def vehicle_text(self) -> str:
@@ -334,7 +347,7 @@ class EnvSpec(_Part):
         return cls(**given)
 
 
-_KINDS: Final[dict[str, type[_Part]]] = {
+_KINDS: dict[str, type[_Part]] = {
     "observation": ArraySpec, "telemetry": ArraySpec, "metrics": Metric, "marks": Mark,
 }  # fmt: skip
 

@@ -3,7 +3,7 @@
 from ..models.cameras import chosen_views
 from ..models.errors import InputError
 from ..models.swarm import drone_names
-from ..sim import Controller, Randomization
+from ..sim import Controller
 from ..sim.sensors import range_sensors_of, readings_of
 from ..sim.sensors.instruments import Instrument
 from ..sim.sensors.range_sensors import RangeSensor
@@ -16,13 +16,15 @@ from .tasks.task import Task
 from .telemetry import quantities_of
 
 
-def make_task(config: EnvConfig, shape: tuple[int, ...] = (1, 1)) -> Task:
+def make_task(config: EnvConfig, shape: tuple[int, int] = (1, 1)) -> Task:
     """The task of a config, for W worlds of A drones. Raises `InputError`."""
     task_class = registry.task_type(config.env_id)
     missing = ", ".join(sorted(task_class.__abstractmethods__))
     if missing:
-        got = f"got {task_class.__name__} without them"
-        raise InputError(f"{config.env_id}: expected a task with the methods {missing}, {got}")
+        raise InputError(
+            f"{config.env_id}: expected a task with the methods {missing}, "
+            f"got {task_class.__name__} without them"
+        )
     task = task_class(config, config.load_vehicle(), shape)
     if not hasattr(task, "observation"):
         raise InputError(f"{config.env_id}: expected setup() to set self.observation, it does not")
@@ -38,8 +40,9 @@ def _check_kept(config: EnvConfig, adjusted: EnvConfig) -> None:
         if isinstance(value, dict):
             value = {**now.get(name, {}), **value}
         if now.get(name) != value:
-            got = f"got {now.get(name)!r}"
-            raise InputError(f"{config.env_id}: expected adjust() to keep {name}, {got}")
+            raise InputError(
+                f"{config.env_id}: expected adjust() to keep {name}, got {now.get(name)!r}"
+            )
 
 
 def spec_of(config: EnvConfig, task: Task) -> EnvSpec:
@@ -86,25 +89,17 @@ def observed(task: Task) -> tuple[ArraySpec, ...]:
 
 def range_sensors_in(task: Task) -> list[RangeSensor]:
     """Sensors with rays of a task's drones. Raises `InputError`."""
-    sensors = task.config.sensors
-    return range_sensors_of(sensors, task.control_period, _latest(task), task.vehicle.radius)
-
-
-def instruments_of(task: Task, shape: tuple[int, int]) -> list[Instrument]:
-    """What measures after each step in W worlds of A drones, in the order of the observation."""
     config = task.config
+    latest = config.drawn.most_steps("observation_delay")
+    return range_sensors_of(config.sensors, task.control_period, latest, task.vehicle.radius)
+
+
+def instruments_of(task: Task) -> list[Instrument]:
+    """What measures after each step, in the order of the observation."""
     instruments: list[Instrument] = []
-    if config.cameras:
-        instruments.append(Pictures(task, config.scene, shape, _latest(task)))
+    if task.config.cameras:
+        instruments.append(Pictures(task))
     return instruments + range_sensors_in(task)
-
-
-def _latest(task: Task) -> int:
-    """Most control steps by which an observation is late."""
-    config = task.config
-    randomize = Randomization(config.randomize, config.effects)
-    late = "observation_delay"
-    return randomize.most_steps(late) if late in randomize.names else 0
 
 
 def _action(controller: Controller) -> ArraySpec | Discrete:
@@ -124,8 +119,6 @@ def _action(controller: Controller) -> ArraySpec | Discrete:
 def _pictures(task: Task) -> tuple[ArraySpec, ...]:
     """What cameras add to an observation; nothing is drawn."""
     config = task.config
-    if not config.cameras:
-        return ()
     views = chosen_views(config.cameras, task.vehicle.cameras)
     if not any(view.kind == "segmentation" for view in views):
         return arrays_of(views, ())

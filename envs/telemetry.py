@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..sim import PARAMETERS, Randomization
+from ..sim import PARAMETERS
 from ..sim.state import Array, ByName, stack
 from .spec import BODY, BODY_TO_WORLD, WORLD, ArraySpec, Bound
 from .tasks.task import Task
@@ -65,7 +65,7 @@ POSE = (
 def quantities_of(task: Task) -> list[Quantity]:
     """What a task's drones have, in the order in which it crosses the wire."""
     effects = task.config.effects
-    drawn = Randomization(task.config.randomize, effects).names
+    drawn = task.config.drawn.names
     quantities = [*POSE, _thrust(task)]
     if effects.battery:
         quantities.append(Quantity("battery", ("charge", "voltage"), ("1", "V"), _battery))

@@ -12,10 +12,9 @@ from .autoreset import (
     AdvancingVectorEnv,
     Array,
     Observation,
-    Seeds,
+    Seed,
     Told,
     checked_mask,
-    checked_seeds,
 )
 from .compiled import make_loop
 from .config import EnvConfig
@@ -68,8 +67,9 @@ class LocalVectorEnv(AdvancingVectorEnv, VectorEnv[Observation, ArrayLike, Array
         self.closed = True  # nothing is open yet
         self.config = config = EnvConfig.from_keywords(env_id, **keywords)
         if type(num_envs) is not int or num_envs % config.drones != 0:
-            expected = f"a multiple of drones = {config.drones}"
-            raise InputError(f"num_envs: expected {expected}, got {num_envs!r}")
+            raise InputError(
+                f"num_envs: expected a multiple of drones = {config.drones}, got {num_envs!r}"
+            )
         self.loop = loop = make_loop(config, num_envs // config.drones)
         self.render_mode = render_mode
         self._renderer = Renderer(render_mode, loop)
@@ -78,9 +78,7 @@ class LocalVectorEnv(AdvancingVectorEnv, VectorEnv[Observation, ArrayLike, Array
         self._nobody = self.lost = self.done = self.out = loop.done
         self.closed = False
 
-    def reset(
-        self, *, seed: int | Seeds | None = None, options: Info | None = None
-    ) -> tuple[Observation, Info]:
+    def reset(self, *, seed: Seed = None, options: Info | None = None) -> tuple[Observation, Info]:
         """Begin an episode, for all drones or some.
 
         Args:
@@ -90,7 +88,7 @@ class LocalVectorEnv(AdvancingVectorEnv, VectorEnv[Observation, ArrayLike, Array
         given = options or {}
         check_names(given, ("reset_mask",), "options")
         mask = checked_mask(given.get("reset_mask"), self.num_envs)
-        self.advance(self._no_actions(), mask, checked_seeds(seed, self.num_envs), ~mask)
+        self.advance(self._nothing, mask, seed, ~mask)
         return self.observations, self._info(mask)
 
     def render(self) -> tuple[Array, ...] | None:
@@ -106,7 +104,7 @@ class LocalVectorEnv(AdvancingVectorEnv, VectorEnv[Observation, ArrayLike, Array
         self,
         actions: ArrayLike,
         resets: Array | None = None,
-        seeds: Seeds | None = None,
+        seeds: Seed = None,
         frozen: Array | None = None,
     ) -> None:
         """See the base."""

@@ -80,8 +80,8 @@ class Randomization:
         return options
 
     def most_steps(self, name: str) -> int:
-        """Longest delay that can be drawn, control steps."""
-        kind, numbers = self._kinds[name]
+        """Longest delay that can be drawn, control steps; 0 where none is."""
+        kind, numbers = self._kinds.get(name, ("", (0.0,)))
         return round(PARAMETERS[name].high if kind == "normal" else max(numbers))
 
     def draw(self, draw: Draw) -> ByName:

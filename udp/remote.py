@@ -14,7 +14,7 @@ from ..envs.autoreset import (
     LOST,
     AdvancingVectorEnv,
     Observation,
-    Seeds,
+    Seed,
     Step,
     checked_mask,
     checked_mode,
@@ -193,8 +193,7 @@ class RemoteEnv(_Remote, gym.Env[Observation, ArrayLike]):
         self.control_period = spec.control_period
         self.observation_space = observation_space(spec)
         self.action_space = action_space(spec)
-        fps = max(1, round(1 / spec.control_period))
-        self.metadata = {"render_modes": [], "render_fps": fps}
+        self.metadata = {"render_modes": [], "render_fps": spec.fps}
         self._arrays = tuple(array.name for array in spec.observation)
         self._names = telemetry_names(spec)
         self._take_actions(spec, 1)
@@ -284,9 +283,7 @@ class RemoteVectorEnv(_Remote, AdvancingVectorEnv, VectorEnv[Observation, ArrayL
         self._take_actions(spec, num_envs)
         self._shape = self.num_simulators, num_envs // self.num_simulators
 
-    def reset(
-        self, *, seed: int | Seeds | None = None, options: Info | None = None
-    ) -> tuple[Observation, Info]:
+    def reset(self, *, seed: Seed = None, options: Info | None = None) -> tuple[Observation, Info]:
         """Begin an episode, for all drones or some.
 
         Where none is under way, before the first reset or after an error, a step wants a reset of
@@ -323,7 +320,7 @@ class RemoteVectorEnv(_Remote, AdvancingVectorEnv, VectorEnv[Observation, ArrayL
         self,
         actions: ArrayLike,
         resets: Array | None = None,
-        seeds: Seeds | None = None,
+        seeds: Seed = None,
         frozen: Array | None = None,
     ) -> None:
         """Reset some drones, freeze some, and fly the others: see `AdvancingVectorEnv`.
@@ -395,7 +392,7 @@ class RemoteVectorEnv(_Remote, AdvancingVectorEnv, VectorEnv[Observation, ArrayL
         earlier = np.full(self.num_envs, None) if self._reasons is None else self._reasons
         self._reasons = np.where(self.lost, reasons, earlier)
 
-    def _seeds(self, seed: int | Seeds | None) -> Array | None:
+    def _seeds(self, seed: Seed) -> Array | None:
         """Seeds as they cross the wire. Raises `InputError`."""
         seeds = checked_seeds(seed, self.num_envs, MAX_UINT64)
         return None if seeds is None else np.array(seeds, np.uint64)
@@ -410,9 +407,6 @@ class RemoteVectorEnv(_Remote, AdvancingVectorEnv, VectorEnv[Observation, ArrayL
         self.rewards = np.where(still, 0.0, np.concatenate([s.rewards for s in states]))
         self.terminated = np.concatenate([s.terminated for s in states]) & ~still
         self.truncated = np.concatenate([s.truncated for s in states]) & ~still
-
-    def _no_actions(self) -> Array:
-        return self._nothing
 
     def _losses(self) -> Info:
         reasons = self._reasons

@@ -71,10 +71,6 @@ class Flight(Stage):
         """Calls of the physics in a step."""
         return self.world.calls(self.substeps, self.held)
 
-    def close(self) -> None:
-        """Close the world."""
-        self.world.close()
-
 
 @dataclass
 class Control(Stage):

@@ -3,7 +3,6 @@
 They have the shape (W, A, steps, *shape), the oldest step first.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -27,22 +26,17 @@ class History(Stage):
 
     steps: int
     """How many."""
-    names: Sequence[str]
-    """Of the arrays that have a history."""
 
     def step(self, record: Record) -> None:
         """A drone that begins fills its history with the present."""
         past = vars(record).get("history", {})
         history = {}
         seen = {}
-        for name in self.names:
-            values = record.observations[name]
-            if values.ndim == 2:  # a number
-                values = values[..., None]
+        for name, values in record.observations.items():
             history[name] = rows = later(past.get(name), values, self.steps, record)
             seen[name] = rows.reshape(*record.shape, -1, *rows.shape[4:])
         record.history = history
-        record.observations = {**record.observations, **seen}
+        record.observations = seen
 
 
 @dataclass

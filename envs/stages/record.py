@@ -1,7 +1,7 @@
 """The record that all stages share, and what a stage is."""
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -69,9 +69,6 @@ class Record:
     terms: ByName
     metrics: ByName
     ended: Array
-    reward: Floats
-    terminated: Mask
-    truncated: Mask
     said: Floats
     heard: Floats
     age: Floats
@@ -194,7 +191,7 @@ class Stage:
     """
 
     arrays: tuple[str, ...] = ()
-    keeps: ClassVar[str] = ""
+    keeps = ""
 
     def begin(self, record: Record) -> None:
         """Set the arrays of drones that begin an episode, those of `record.begun`."""
@@ -214,9 +211,6 @@ class Stage:
         """Put a snapshot back; the record has been restored, and so have stages before this."""
         if self.keeps:
             getattr(self, self.keeps).restore(arrays)
-
-    def close(self) -> None:
-        """Release threads and memory."""
 
 
 def merged(mask: Mask, new: Any, old: Any) -> Any:

@@ -7,13 +7,13 @@ import numpy as np
 
 from ...models import InputError
 from ...models.fields import Limits, immutable
-from ...models.matrices import right_inverse
+from ...models.matrices import cross, right_inverse
 from ...sim import Array, Draw, InitialState, atan2, cos, length, parts_of, sin, stack, total
 from ..config import EnvConfig
-from ..spec import Metric
 from ..state import State
 from .goal import (
     MAX_SPEED,
+    PAYLOAD_ERROR,
     WORST_SWING,
     Share,
     along,
@@ -80,10 +80,7 @@ class Cable(Swarm):
 
     Options = CableOptions
     worst_step = Swarm.worst_step + WORST_SWING
-    metrics = (
-        Metric(name="payload_error", unit="m", settled=0.1, held=0.1, symbol="e"),
-        *Swarm.metrics[1:],
-    )
+    metrics = (PAYLOAD_ERROR, *Swarm.metrics[1:])
     max_drones = 32
 
     def setup(self) -> None:
@@ -147,9 +144,7 @@ class Cable(Swarm):
         lift = load + weight
         force = math.sqrt(inwards * inwards + lift * lift)
         even = force * (vehicle.hover_thrust / weight)
-        a, b, c = vehicle.center_of_mass.tolist()
-        x, y, z = parts_of(pull)
-        torque = stack((b * z - c * y, c * x - a * z, a * y - b * x))
+        torque = stack(cross(vehicle.center_of_mass.tolist(), parts_of(pull)))
         wanted = np.concatenate((force + 0.0 * azimuth[..., None], torque), axis=-1)
         missing = wanted - total(vehicle.allocation * even)
         return even + total(self._allocated * missing[..., None, :])
@@ -162,11 +157,9 @@ class Cable(Swarm):
         azimuth = turn + self._azimuths
         half = self._tilt / 2
         sine = sin(half)
-        zero = 0.0 * azimuth
-        cosine = cos(half) + zero
         return InitialState(
             position=ball + self._around(turn),
-            quaternion=stack((cosine, -sine * sin(azimuth), sine * cos(azimuth), zero)),
+            quaternion=stack((cos(half), -sine * sin(azimuth), sine * cos(azimuth), 0.0 * azimuth)),
             thrust=self.carrying(azimuth),
             payload=ball,
         )

@@ -1,16 +1,15 @@
 """`rotorgram/Dodge-v0`: keep a place between balls that are thrown and posts that cross it."""
 
-from collections.abc import Mapping
-from typing import Any, ClassVar
+from types import MappingProxyType
+from typing import Any
 
 import numpy as np
 
 from ...models.fields import immutable
 from ...scenes import SceneConfig
 from ...sim import Array, Draw, InitialState, exp
-from ..spec import Metric
 from ..state import State
-from .goal import Distance, Point, Tilt
+from .goal import LEAST_CLEARANCE, SUCCESS, TOUCHED, Distance, Point, Tilt
 from .hover import Hover, HoverOptions
 from .task import Outcome
 
@@ -66,16 +65,8 @@ class Dodge(Hover):
     action = "velocity"
     control_period = 0.04
     episode_length = 300
-    defaults: ClassVar[Mapping[str, Any]] = {
-        "vehicle": ("hummingbird",),
-        "sensors": {"lidar": _LIDAR},
-    }
-    metrics = (
-        Metric(name="success", unit="", goal="high", held=0.5, final=True),
-        Metric(name="touched", unit="", final=True),
-        *Hover.metrics,
-        Metric(name="least_clearance", unit="m", goal="high", final=True),
-    )
+    defaults = MappingProxyType({"vehicle": ("hummingbird",), "sensors": {"lidar": _LIDAR}})
+    metrics = (SUCCESS, TOUCHED, *Hover.metrics, LEAST_CLEARANCE)
 
     @classmethod
     def scene(cls, options: Any) -> SceneConfig:

@@ -17,7 +17,7 @@ from ...sim import (
 )  # fmt: skip
 from ..spec import ArraySpec, Metric
 from ..state import State
-from .goal import AIR, check_more, ends_of, nearness
+from .goal import AIR, Number, NumberOrRange, array_of, check_more, ends_of, nearness
 from .task import Outcome, Task, TaskOptions
 
 TERMINATION_REWARD = -20.0
@@ -34,7 +34,7 @@ Observed = Literal["full", "error"]
 class ElevationOptions(TaskOptions):
     """Options of `rotorgram/Elevation-v0`."""
 
-    target: Annotated[float | tuple[float, float], NumberOrPair(Limits(unit="m"))] = 5.0
+    target: Annotated[NumberOrRange, NumberOrPair(Limits(unit="m"))] = 5.0
     """Target elevation Y, m: a number, or (low, high) to draw one uniformly for each episode."""
     start_band: Annotated[float, Limits(0.0, FURTHEST, "m")] = 1.0
     """An episode starts at rest, hovering, up to this far above or below the target, m."""
@@ -199,14 +199,8 @@ class Elevation(Task):
         size = 3 if self.options.observation == "full" else 1
         # Rounding to float32 may move a bound inwards by half a unit: step outwards once.
         outwards = np.float32(np.inf)
-        low = np.nextafter(lows, -outwards)[:size]
-        high = np.nextafter(highs, outwards)[:size]
-        return ArraySpec(
-            name="observation",
-            shape=(size,),
-            low=tuple(low.tolist()),
-            high=tuple(high.tolist()),
-            unit=("m", "m/s", "1")[:size],
-            frame="world, up",
-            components=("elevation error", "rate of the error", "thrust over hover")[:size],
-        )
+        low = np.nextafter(lows, -outwards).tolist()
+        high = np.nextafter(highs, outwards).tolist()
+        names = ("elevation error", "rate of the error", "thrust over hover")
+        rows = zip(names, ("m", "m/s", "1"), low, high, strict=True)
+        return array_of([Number(*row) for row in rows][:size], "world, up")

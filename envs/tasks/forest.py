@@ -1,6 +1,6 @@
 """`rotorgram/Forest-v0`: through a wood to a goal at a wanted speed."""
 
-from collections.abc import Mapping
+from types import MappingProxyType
 from typing import Annotated, Any, ClassVar
 
 import numpy as np
@@ -23,7 +23,20 @@ from ...sim import (
 )
 from ..spec import ArraySpec, Metric
 from ..state import State
-from .goal import LEAST_TILT_COSINE, MAX_RATE, MAX_SPEED, Number, along, array_of, ends_of
+from .goal import (
+    FLIGHT_TIME,
+    LEAST_CLEARANCE,
+    LEAST_TILT_COSINE,
+    MAX_RATE,
+    MAX_SPEED,
+    SUCCESS,
+    TOUCHED,
+    Number,
+    NumberOrRange,
+    along,
+    array_of,
+    ends_of,
+)
 from .task import Outcome, Task, TaskOptions
 
 AISLE = 2.0
@@ -47,7 +60,7 @@ class ForestOptions(TaskOptions):
 
     density: Annotated[float, Limits(1e-3, 0.5, "1/m²")] = 0.1
     """Trees per square metre."""
-    speed: Annotated[float | tuple[float, float], NumberOrPair(Limits(0.5, 20.0, "m/s"))] = 3.0
+    speed: Annotated[NumberOrRange, NumberOrPair(Limits(0.5, 20.0, "m/s"))] = 3.0
     """Wanted speed, m/s; of a pair, each episode draws one between."""
     way: Annotated[float, Limits(*_WAY, "m")] = 30.0
     """From start to goal, m."""
@@ -96,27 +109,29 @@ class Forest(Task):
     """
 
     Options: ClassVar[type[TaskOptions]] = ForestOptions
-    heights: ClassVar[tuple[float, float]] = (1.3, 2.2)
+    heights = (1.3, 2.2)
     """Lowest and highest start and goal, m."""
-    ceiling: ClassVar[float] = 4.0
+    ceiling = 4.0
     """A craft does not fly over what stands there, m."""
-    reached: ClassVar[float] = 1.0
+    reached = 1.0
     """Largest distance of an arrival from the goal, in the plane and in height, m."""
     worst_step = -(_SPEEDING + _ASIDE + _NEAR + 2 * _CHANGE)
     action = "velocity"
     control_period = 0.05
     episode_length = 400
-    defaults: ClassVar[Mapping[str, Any]] = {
-        "vehicle": ("hummingbird",),
-        "sensors": {"depth": {"rows": 6, "columns": 32, "fov": 120.0}},
-    }
+    defaults = MappingProxyType(
+        {
+            "vehicle": ("hummingbird",),
+            "sensors": {"depth": {"rows": 6, "columns": 32, "fov": 120.0}},
+        }
+    )
     metrics = (
-        Metric(name="success", unit="", goal="high", held=0.5, final=True),
-        Metric(name="touched", unit="", final=True),
+        SUCCESS,
+        TOUCHED,
         Metric(name="mean_speed", unit="m/s", goal="high", final=True),
         Metric(name="top_speed", unit="m/s", goal="high", final=True),
-        Metric(name="least_clearance", unit="m", goal="high", final=True),
-        Metric(name="flight_time", unit="s", final=True),
+        LEAST_CLEARANCE,
+        FLIGHT_TIME,
     )
 
     @classmethod
@@ -151,12 +166,13 @@ class Forest(Task):
         numbers.append(Number("goal - height", "m", -10.0, 10.0))
         numbers += along("velocity", "m/s", MAX_SPEED) + along("thrust axis", "1", 1.001)
         numbers += along("body rate", "rad/s", MAX_RATE)
-        numbers.append(Number("height", "m", -10.0, 100.0))
-        numbers.append(Number("way", "m", 0.0, furthest))
-        numbers.append(Number("wanted speed", "m/s", 0.0, MAX_SPEED))
-        numbers.append(Number("time left", "s", -100.0, 100.0))
-        controller = self.controller
-        for name in controller.components:
+        numbers += [
+            Number("height", "m", -10.0, 100.0),
+            Number("way", "m", 0.0, furthest),
+            Number("wanted speed", "m/s", 0.0, MAX_SPEED),
+            Number("time left", "s", -100.0, 100.0),
+        ]
+        for name in self.controller.components:
             numbers.append(Number(f"last {name}", "1", -1.0, 1.0))
         array = array_of(numbers, "world turned by the heading; body rates: body")
         self.observation = (array,)
@@ -168,17 +184,15 @@ class Forest(Task):
         memory = self.memory
         memory.height = height[..., 1]
         memory.speed = draw.uniform(*ends_of(self.options.speed))
-        memory.way = 0.0 * memory.speed + 2 * self._half
+        memory.way = 2 * self._half
         memory.progress = memory.change = memory.path = memory.top = 0.0
-        memory.least = 0.0 * memory.speed + np.inf
+        memory.least = np.inf
         memory.last = np.zeros_like(height, shape=(*mask.shape, len(self.controller.components)))
-        start = stack((0.0 * memory.speed - self._half, 0.0 * memory.speed, height[..., 0]))
-        return InitialState(position=start)
+        return InitialState(position=stack((-self._half, 0.0, height[..., 0])))
 
     def goal(self, state: State) -> Array:
         """Behind what is to be crossed."""
-        height = self.memory.height
-        return stack((0.0 * height + self._half, 0.0 * height, height))
+        return stack((self._half, 0.0, self.memory.height))
 
     def update_memory(self, state: State) -> None:
         """How much shorter the way became; what was flown; what came nearest."""
@@ -198,7 +212,7 @@ class Forest(Task):
         """See the class."""
         memory = self.memory
         x, y, _ = parts_of(body_x(state.quaternion))
-        size = square_root(x * x + y * y) + 1e-9
+        size = distance_of(x, y) + 1e-9
         c, s = x / size, y / size
 
         def turned(a: Array, b: Array) -> tuple[Array, Array]:
@@ -206,14 +220,14 @@ class Forest(Task):
 
         to_goal = self.goal(state) - state.position
         dx, dy, up = parts_of(to_goal)
-        way = self._straight(state.position)
+        way = Forest.way(self, state.position)  # straight on, also where racks are in it
         wanted = memory.speed / (way + 1e-6)
         vx, vy, vz = parts_of(state.velocity)
         ax, ay, az = parts_of(body_z(state.quaternion))
         left = way / memory.speed
         parts = (
             *turned(wanted * dx, wanted * dy), up, *turned(vx, vy), vz, *turned(ax, ay), az,
-            *parts_of(state.body_rates), state.position[..., 2], way, memory.speed + 0.0 * way,
+            *parts_of(state.body_rates), state.position[..., 2], way, memory.speed,
             left, *parts_of(memory.last),
         )  # fmt: skip
         observed = {"observation": clip(stack(parts), *self._bounds)}
@@ -265,11 +279,9 @@ class Forest(Task):
         return Outcome(reward=terms, terminated=crashed | success, metrics=metrics)
 
     def way(self, position: Array) -> Array:
-        """Length of the way to the goal, of which the reward counts the progress, m, (W, A)."""
-        return self._straight(position)
-
-    def _straight(self, position: Array) -> Array:
-        """To the goal in the plane, m."""
+        """Length of the way to the goal, of which the reward counts the progress, m, (W, A): in
+        the plane.
+        """
         x, y, _ = parts_of(position)
         return distance_of(self._half - x, y)
 

@@ -1,7 +1,7 @@
 """`rotorgram/Gates-v0`: a race through gates that are solid, along a track of each episode."""
 
-from collections.abc import Mapping
-from typing import Annotated, ClassVar
+from types import MappingProxyType
+from typing import Annotated
 
 from ...models import InputError
 from ...models.fields import Limits, immutable
@@ -9,7 +9,7 @@ from ...scenes import SceneConfig
 from ...scenes.generators import GATES_SIZE, OPENING
 from ...sim import Array, Draw, InitialState, square_root, stack
 from .goal import Distance, Margin
-from .racing import MAX_LAPS, Racing
+from .racing import Laps, Racing
 from .task import TaskOptions
 
 _COUNT = 8
@@ -23,7 +23,7 @@ class GatesOptions(TaskOptions):
 
     opening: Annotated[float, Limits(1.0, 20.0, "m")] = 1.5
     """Width of a gate inside, m; the track grows with it."""
-    laps: Annotated[int, Limits(1, MAX_LAPS, whole=True)] = 1
+    laps: Laps = 1
     """Rounds of all gates."""
     start_band: Distance = 0.1
     """Largest distance of the start from the line through the first gate along each axis, m."""
@@ -60,7 +60,7 @@ class Gates(Racing):
     """
 
     Options = GatesOptions
-    defaults: ClassVar[Mapping[str, object]] = {"vehicle": ("hummingbird",)}
+    defaults = MappingProxyType({"vehicle": ("hummingbird",)})
 
     @classmethod
     def scene(cls, options: GatesOptions) -> SceneConfig:
@@ -76,8 +76,10 @@ class Gates(Racing):
         scale = scene.values.scale
         half = scale * OPENING / 2
         if half <= self.vehicle.radius:
-            expected = f"gates wider than the craft, {2 * self.vehicle.radius:.3g} m"
-            raise InputError(f"opening: expected {expected}, got {2 * half:g} m")
+            raise InputError(
+                f"opening: expected gates wider than the craft, {2 * self.vehicle.radius:.3g} m, "
+                f"got {2 * half:g} m"
+            )
         self.body = self.action in ("rotors", "rates")
         reach = 2 * scale * _RING + 2 * self.options.margin
         self.define_race(_COUNT, reach, half)
@@ -94,6 +96,6 @@ class Gates(Racing):
         self.memory.track = track
         c, s = track[..., 0, 3], track[..., 0, 4]
         behind = _BEHIND * self.config.scene.values.scale
-        position = track[..., 0, :3] - behind * stack((c, s, 0.0 * c)) + offset
+        position = track[..., 0, :3] - behind * stack((c, s, 0.0)) + offset
         w = square_root((1.0 + c) / 2)  # the first gate faces left of the ring: c > -0.5
         return self.start(position, stack((w, 0.0 * c, 0.0 * c, s / (2 * w))))

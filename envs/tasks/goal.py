@@ -25,7 +25,7 @@ from ...sim import (
     world_z,
 )
 from ..config import EnvConfig
-from ..spec import ArraySpec
+from ..spec import ArraySpec, Metric
 from ..state import State
 from .task import Outcome, Task
 
@@ -55,6 +55,17 @@ class Number(NamedTuple):
     low: float
     high: float
 
+
+# Metrics of several tasks.
+POSITION_ERROR = Metric(name="position_error", unit="m", settled=0.1, held=0.1, symbol="e")
+PAYLOAD_ERROR = Metric(name="payload_error", unit="m", settled=0.1, held=0.1, symbol="e")
+SUCCESS = Metric(name="success", unit="", goal="high", held=0.5, final=True)
+TOUCHED = Metric(name="touched", unit="", final=True)
+LEAST_CLEARANCE = Metric(name="least_clearance", unit="m", goal="high", final=True)
+FLIGHT_TIME = Metric(name="flight_time", unit="s", final=True)
+
+NumberOrRange = float | tuple[float, float]
+"""Of an option: a number, or (low, high) to draw one for each episode."""
 
 Point = Annotated[tuple[float, float, float], Limits(-FURTHEST, FURTHEST, "m", count=3)]
 """Of an option: x, y, z in MuJoCo's world frame (z up), m."""
@@ -152,15 +163,12 @@ class GoalTask(Task):
         dtype = state.thrust.dtype
         hover = np.asarray(self.vehicle.hover_thrust, dtype)
         thrust = state.thrust / hover - 1.0
-        parts = [*vectors, state.body_rates, thrust]
-        for values in self.further(state):
-            is_number = np.ndim(values) < position.ndim
-            parts.append(stack((values,)) if is_number else values)
+        parts = [*vectors, state.body_rates, thrust, *self.further(state)]
         bounds = [bound.astype(dtype) for bound in self._bounds]
         return {"observation": clip(np.concat(parts, axis=-1), *bounds)}
 
     def further(self, state: State) -> Sequence[Array]:
-        """Numbers, (W, A), and vectors, (W, A, k), of the observation, as they were defined."""
+        """Further vectors, (W, A, k), of the observation, as they were defined."""
         return ()
 
     def goal(self, state: State) -> Array:
@@ -178,7 +186,7 @@ class GoalTask(Task):
         azimuth = draw.uniform(-math.pi, math.pi)
         sine = sin(tilt / 2)
         w = cos(tilt / 2)
-        return stack((w, sine * cos(azimuth), sine * sin(azimuth), 0.0 * w))
+        return stack((w, sine * cos(azimuth), sine * sin(azimuth), 0.0))
 
     def distance(self, state: State) -> Array:
         """From each drone to its goal, m, shape (W, A)."""
@@ -227,7 +235,7 @@ def at(point: Sequence[float], like: Array) -> Array:
     return stack([0.0 * like + value for value in point])
 
 
-def ends_of(range_: float | tuple[float, float]) -> tuple[float, float]:
+def ends_of(range_: NumberOrRange) -> tuple[float, float]:
     """Low and high end of an option that is a number or a pair."""
     return range_ if isinstance(range_, tuple) else (range_, range_)
 
@@ -275,8 +283,10 @@ def check_room(task: Task, reach: float) -> None:
     needed = reach + task.vehicle.radius
     room = scene.values.room
     if scene.is_seeded and room < needed:
-        expected = f"one that leaves {needed:.3g} m about the z axis to {task.config.env_id}"
-        raise InputError(f"scene: expected {expected}, got {scene}, which leaves {room:.3g}")
+        raise InputError(
+            f"scene: expected one that leaves {needed:.3g} m about the z axis to "
+            f"{task.config.env_id}, got {scene}, which leaves {room:.3g}"
+        )
 
 
 def check_more(name: str, size: float, what: str, least: float) -> None:

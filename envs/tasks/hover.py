@@ -20,6 +20,7 @@ from ..spec import Metric
 from ..state import State
 from .goal import (
     ERROR_SCALE,
+    POSITION_ERROR,
     WORST_RATES,
     Distance,
     GoalTask,
@@ -88,11 +89,11 @@ class Hover(GoalTask):
     """
 
     Options = HoverOptions
-    near: ClassVar[float] = ERROR_SCALE
+    near = ERROR_SCALE
     """Distance at which the reward for nearness crosses zero, m."""
     worst_step = -1.0 - HEADING_WEIGHT + WORST_RATES
     metrics: ClassVar[tuple[Metric, ...]] = (
-        Metric(name="position_error", unit="m", settled=0.1, held=0.1, symbol="e"),
+        POSITION_ERROR,
         Metric(name="heading_error", unit="deg", settled=5.0, signed=True),
     )
 

@@ -13,7 +13,10 @@ from ..state import State
 from .goal import (
     COURSE_RATE_WEIGHT,
     COURSE_WORST_RATES,
+    Distance,
     GoalTask,
+    NumberOrRange,
+    Size,
     SlowSpeed,
     Upright,
     along,
@@ -28,7 +31,6 @@ MATCHING_TIME = 0.5  # Progress that 1 m/s less relative speed is worth, over 1 
 LANDING_REWARD = 20.0  # Added to the reward of a step that ends with a landing
 TIME_COST = 0.1  # Of each step
 FASTEST_PAD = 20.0  # m/s
-FURTHEST = 1e3  # m
 
 Motion = Literal["circle", "line"]
 
@@ -39,14 +41,12 @@ class LandingOptions(TaskOptions):
 
     motion: Motion = "circle"
     """Path of the pad about (0, 0): a `circle`, or a `line` on which it swings to and fro."""
-    pad_path: Annotated[float, Limits(0.01, FURTHEST, "m")] = 2.0
+    pad_path: Size = 2.0
     """Radius of the circle, or half the length of the line, m."""
-    pad_speed: Annotated[
-        float | tuple[float, float], NumberOrPair(Limits(0.0, FASTEST_PAD, "m/s"))
-    ] = (0.0, 1.0)
+    pad_speed: Annotated[NumberOrRange, NumberOrPair(Limits(0.0, FASTEST_PAD, "m/s"))] = (0.0, 1.0)
     """Speed of the pad, m/s, on a line the largest: a number, or (low, high) to draw one uniformly
     for each episode."""
-    pad_radius: Annotated[float, Limits(0.01, FURTHEST, "m")] = 0.5
+    pad_radius: Size = 0.5
     """A landing's largest horizontal distance of the body's origin from the pad's centre, m."""
     sink: SlowSpeed = 1.0
     """A landing's largest vertical speed, m/s."""
@@ -54,11 +54,11 @@ class LandingOptions(TaskOptions):
     """A landing's largest horizontal speed relative to the pad, m/s."""
     tilt: Upright = 15.0
     """A landing's largest tilt, degrees."""
-    start_height: Annotated[float, Limits(0.1, FURTHEST, "m")] = 4.0
+    start_height: Size = 4.0
     """Mean height at the start above that of a craft on the ground, m."""
-    start_band: Annotated[float, Limits(0.0, FURTHEST, "m")] = 1.0
+    start_band: Distance = 1.0
     """Largest distance of the start from (0, 0, mean height) along each axis, m."""
-    flight_band: Annotated[float, Limits(0.1, 10 * FURTHEST, "m")] = 10.0
+    flight_band: Size = 10.0
     """An episode terminates when the craft is further than this from the pad, m."""
 
     def check(self) -> None:
@@ -235,7 +235,7 @@ class Landing(GoalTask):
         across = memory.side * across
         x = memory.cosine * along - memory.sine * across
         y = memory.sine * along + memory.cosine * across
-        return stack((x, y, 0.0 * x + height))
+        return stack((x, y, height))
 
     def _potential_of(self, position: Array, velocity: Array) -> Array:
         """Minus the distance to the goal, m, and what the relative speed counts."""

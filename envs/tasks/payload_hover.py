@@ -17,6 +17,7 @@ from ..spec import Metric
 from ..state import State
 from .goal import (
     MAX_SPEED,
+    PAYLOAD_ERROR,
     WORST_RATES,
     WORST_SWING,
     Distance,
@@ -99,7 +100,7 @@ class PayloadHover(GoalTask):
     Options = PayloadHoverOptions
     worst_step = -1.0 + WORST_SWING + WORST_RATES
     metrics = (
-        Metric(name="payload_error", unit="m", settled=0.1, held=0.1, symbol="e"),
+        PAYLOAD_ERROR,
         Metric(name="swing", unit="deg", settled=5.0),
     )
 
@@ -127,12 +128,11 @@ class PayloadHover(GoalTask):
         tilted = self.tilted(draw)
         along = draw.uniform(-fastest, fastest)
         across = draw.uniform(-fastest, fastest)
-        carrying = (1.0 + options.payload_share) * self.vehicle.hover_thrust
         return InitialState(
             position=self._above(along) + offset,
             quaternion=tilted,
             velocity=stack((along, across, 0.0)),
-            thrust=carrying + (0.0 * along)[..., None],
+            thrust=(1.0 + options.payload_share) * self.vehicle.hover_thrust,
         )
 
     def _above(self, like: Array) -> Array:

@@ -30,6 +30,7 @@ from ..state import State
 from .goal import (
     COURSE_RATE_WEIGHT,
     COURSE_WORST_STEP,
+    FLIGHT_TIME,
     PASSING_REWARD,
     Distance,
     GoalTask,
@@ -46,8 +47,10 @@ from .task import Outcome, TaskOptions
 
 TRACKS = Path(__file__).parent.parent / "tracks"
 MAX_GATES = 64
-MAX_LAPS = 1000
 _WAY = "a track of ours, a TOML file of gates, or its content as JSON"
+
+Laps = Annotated[int, Limits(1, 1000, whole=True)]
+"""Of an option: rounds of all gates."""
 
 
 @immutable
@@ -82,7 +85,7 @@ class RacingOptions(TaskOptions):
     track: str = "oval"
     """A track of ours (`oval`, `dive`), or a TOML file with its gates and its start. It is kept as
     JSON, so that it crosses the wire."""
-    laps: Annotated[int, Limits(1, MAX_LAPS, whole=True)] = 1
+    laps: Laps = 1
     """Rounds of all gates."""
     start_band: Distance = 0.5
     """Largest distance of the start from that of the track along each axis, m."""
@@ -144,7 +147,7 @@ class Racing(GoalTask):
     episode_length = 1500
     metrics = (
         Metric(name="gates_left", unit="", settled=0.5, held=0.5, final=True),
-        Metric(name="flight_time", unit="s", final=True),
+        FLIGHT_TIME,
         Metric(name="lap_time", unit="s", final=True),
     )
 
@@ -217,20 +220,20 @@ class Racing(GoalTask):
         aside = y * gate[..., 3] - x * gate[..., 4]
         inside = (abs(aside) <= half) & (abs(z) <= half)
         left = memory.passed < self._total
-        passing = (through & inside & left) * 1.0
-        passed = memory.passed + passing
-        whole = (passing > 0.5) & (remainder(passed, self._count) == 0.0)
+        is_passed = through & inside & left
+        passed = memory.passed + is_passed
+        whole = is_passed & (remainder(passed, self._count) == 0.0)
         way = center - memory.behind
         come = state.position - memory.behind
         along = total(come * way) / (total(way * way) + 1e-12)
         memory.off = length(come - clip(along, 0.0, 1.0)[..., None] * way)
         memory.progress = length(before) - length(now)
         memory.passed = passed
-        memory.passing = passing
+        memory.passing = is_passed * 1.0
         memory.lap = np.where(whole, state.time - memory.lap_began, memory.lap)
         memory.lap_began = np.where(whole, state.time, memory.lap_began)
         memory.position = state.position
-        memory.behind = np.where((passing > 0.5)[..., None], center, memory.behind)
+        memory.behind = np.where(is_passed[..., None], center, memory.behind)
 
     def _ahead(self, gate: Array, way: Array) -> Array:
         """How far a way from the centre of a gate leads in its direction, m, (W, A)."""
@@ -246,7 +249,7 @@ class Racing(GoalTask):
             level = 0.0 * way[..., :1]
             vectors = [np.concat((vector, level), axis=-1)[..., :3] for vector in vectors]
             vectors = [to_body(state.quaternion, vector) for vector in vectors]
-        return *vectors, gate[..., 5]
+        return *vectors, gate[..., 5:]
 
     def outcome(self, state: State) -> Outcome:
         """Progress to the next gate; the end at the last one, or off the track."""
@@ -259,7 +262,7 @@ class Racing(GoalTask):
 
     def goal(self, state: State) -> Array:
         """The centre of the next gate."""
-        return self._gate(self.memory.passed)[..., :3] + 0.0 * state.position
+        return self._gate(self.memory.passed)[..., :3]
 
     def _gate(self, passed: Array) -> Array:
         """The next gate after `passed` gates, shape (..., 6); after the last gate, the last."""

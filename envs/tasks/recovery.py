@@ -22,6 +22,7 @@ from .goal import (
     WORST_RATES,
     GoalTask,
     Point,
+    Size,
     SlowSpeed,
     Speed,
     Upright,
@@ -49,13 +50,13 @@ class RecoveryOptions(TaskOptions):
     spin: Annotated[float, Limits(0.0, 100.0, "rad/s")] = 10.0
     """Largest rate about each body axis at the start, rad/s; no faster than the vehicle's largest
     torque about that axis stops in 0.5 s."""
-    near: Annotated[float, Limits(0.01, 1e3, "m")] = 0.5
+    near: Size = 0.5
     """A craft has recovered while it is nearer to the goal than this, m, ..."""
     slow: SlowSpeed = 0.5
     """... slower than this, m/s, ..."""
     upright: Upright = 15.0
     """... and tilted by less than this, degrees."""
-    flight_band: Annotated[float, Limits(0.1, 1e4, "m")] = 15.0
+    flight_band: Size = 15.0
     """An episode terminates when the craft is further than this from its goal, m."""
     frame: Frame | None = None
     """Frame of the observation; by default that in which the action acts: `body` with the actions

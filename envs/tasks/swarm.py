@@ -12,6 +12,7 @@ from ..spec import Metric
 from ..state import State
 from .goal import (
     MAX_SPEED,
+    POSITION_ERROR,
     WORST_RATES,
     Distance,
     GoalTask,
@@ -70,7 +71,7 @@ class Swarm(GoalTask):
     """
 
     metrics = (
-        Metric(name="position_error", unit="m", settled=0.1, held=0.1, symbol="e"),
+        POSITION_ERROR,
         Metric(name="clearance", unit="m", goal="high"),
     )
     min_drones = 2
@@ -198,21 +199,19 @@ def angles(count: int) -> np.ndarray:
 
 def on_circle(angle: Array, radius: float, height: float = 0.0) -> Array:
     """Places on a level circle, shape (..., 3), from a point below its middle."""
-    x = radius * cos(angle)
-    return stack((x, radius * sin(angle), 0.0 * x + height))
+    return stack((radius * cos(angle), radius * sin(angle), height))
 
 
-def line(count: int) -> np.ndarray:
+def line(count: int) -> Array:
     """Places on a line along y, 1 apart, shape (A, 3)."""
-    zero = np.zeros(count)
-    return np.stack((zero, np.arange(count) - (count - 1) / 2, zero), axis=-1)
+    return stack((0.0, np.arange(count) - (count - 1) / 2, 0.0))
 
 
 def grid(count: int) -> Array:
     """Places of a level grid, nearly a square, 1 apart, shape (A, 3)."""
     side = int(np.ceil(np.sqrt(count)))
     rows, columns = np.divmod(np.arange(count), side)
-    places = np.stack((rows, columns, 0 * rows), axis=-1).astype(float)
+    places = stack((rows, columns, 0)).astype(float)
     return places - (places.min(axis=0) + places.max(axis=0)) / 2
 
 

@@ -101,23 +101,23 @@ class Task(ABC):
 
     Options: ClassVar[type[TaskOptions]] = TaskOptions
     metrics: ClassVar[tuple[Metric, ...]] = ()
-    min_drones: ClassVar[int] = 1
-    max_drones: ClassVar[int] = 1
+    min_drones = 1
+    max_drones = 1
     actions: ClassVar[tuple[str, ...]] = LEVELS
     defaults: ClassVar[Mapping[str, Any]] = {}
-    has_radio: bool = False
-    worst_step: ClassVar[float] = 0.0
+    has_radio = False
+    worst_step = 0.0
 
-    action: str = "rotors"
-    control_period: float = 0.02
+    action = "rotors"
+    control_period = 0.02
     """s; the default is that of Unity's `FixedUpdate`."""
-    episode_length: int = 250
+    episode_length = 250
     """Control steps."""
     controller: Controller
     observation: tuple[ArraySpec, ...]
     marks: tuple[Mark, ...] = ()
 
-    def __init__(self, config: "EnvConfig", vehicle: "Vehicle", shape: tuple[int, ...]) -> None:
+    def __init__(self, config: "EnvConfig", vehicle: "Vehicle", shape: tuple[int, int]) -> None:
         self.config = config
         self.vehicle = vehicle
         self.shape = shape

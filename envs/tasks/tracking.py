@@ -141,7 +141,7 @@ class Tracking(GoalTask):
 
     def goal(self, state: State) -> Array:
         """Where it should be."""
-        return self._at(self._table, 0.0) + 0.0 * state.position
+        return self._at(self._table, 0.0)
 
     def _at(self, table: np.ndarray, ahead: float) -> Array:
         """Row of a table, `ahead` steps ahead: shape (..., 3)."""

@@ -1,7 +1,7 @@
 """`rotorgram/Warehouse-v0`: to a goal behind rows of racks whose aisles may be closed."""
 
-from collections.abc import Mapping
-from typing import Annotated, ClassVar
+from types import MappingProxyType
+from typing import Annotated
 
 import numpy as np
 
@@ -13,6 +13,7 @@ from ...sim import Array, Draw, InitialState, parts_of, stack
 from ..spec import ArraySpec
 from ..state import State
 from .forest import Forest, distance_of
+from .goal import NumberOrRange
 from .task import Outcome, TaskOptions
 
 _TIME = 0.02  # cost of a step
@@ -24,7 +25,7 @@ _SAID = 1.0
 class WarehouseOptions(TaskOptions):
     """Options of `rotorgram/Warehouse-v0`."""
 
-    speed: Annotated[float | tuple[float, float], NumberOrPair(Limits(0.3, 5.0, "m/s"))] = 1.2
+    speed: Annotated[NumberOrRange, NumberOrPair(Limits(0.3, 5.0, "m/s"))] = 1.2
     """Wanted speed, m/s; of a pair, each episode draws one between."""
     rows: Annotated[int, Limits(1, 8, whole=True)] = 2
     """Of racks, one after the other."""
@@ -72,10 +73,12 @@ class Warehouse(Forest):
     worst_step = Forest.worst_step - _TIME
     control_period = 0.1
     episode_length = 150
-    defaults: ClassVar[Mapping[str, object]] = {
-        "vehicle": ("crazyflie2",),
-        "sensors": {"tof": {"model": "vl53l5cx", "reach": 2.0}},
-    }
+    defaults = MappingProxyType(
+        {
+            "vehicle": ("crazyflie2",),
+            "sensors": {"tof": {"model": "vl53l5cx", "reach": 2.0}},
+        }
+    )
 
     @classmethod
     def scene(cls, options: WarehouseOptions) -> SceneConfig:
@@ -129,7 +132,7 @@ class Warehouse(Forest):
         leads back to its mouth first.
         """
         x, y, _ = parts_of(position)
-        way = distance_of(self._half - x, y)
+        way = super().way(position)
         last_x, last_y, left = self._half + 0.0 * x, 0.0 * y, 0.0 * x
         for row in reversed(range(self.config.scene.values.counts[0])):
             middle, door = parts_of(self.memory.doors[..., row, :])

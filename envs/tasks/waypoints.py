@@ -11,6 +11,7 @@ from ..state import State
 from .goal import (
     COURSE_RATE_WEIGHT,
     COURSE_WORST_STEP,
+    FLIGHT_TIME,
     FURTHEST,
     PASSING_REWARD,
     GoalTask,
@@ -86,7 +87,7 @@ class Waypoints(GoalTask):
     episode_length = 750
     metrics = (
         Metric(name="points_left", unit="", settled=0.5, held=0.5, final=True),
-        Metric(name="flight_time", unit="s", final=True),
+        FLIGHT_TIME,
     )
 
     def setup(self) -> None:
@@ -100,10 +101,12 @@ class Waypoints(GoalTask):
 
     def begin(self, mask: Array, draw: Draw) -> InitialState:
         """At rest, level, somewhere in the box; the points are drawn alike."""
-        options, count = self.options, self.options.points
+        options = self.options
         center = np.array(options.center)
         box = np.array(options.box)
-        start, *points = [center + box * draw.uniform(-1.0, 1.0, (3,)) for _ in range(count + 1)]
+        start, *points = [
+            center + box * draw.uniform(-1.0, 1.0, (3,)) for _ in range(options.points + 1)
+        ]
         memory = self.memory
         memory.points = np.stack(points, axis=-2)
         memory.distance = length(points[0] - start)
