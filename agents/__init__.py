@@ -16,15 +16,15 @@ if TYPE_CHECKING:
     from .geometric import Geometric
     from .making import make_agent, resume_agent
     from .pid import PID
-    from .policies import NetworkPolicy, Policy
+    from .policies import Policy
     from .ppo import PPOConfig
     from .presets import find_preset, preset
-    from .registry import ALGORITHMS, Agent, find_algorithm
+    from .registry import ALGORITHMS, find_algorithm
     from .vpg import VPGConfig
 
 __all__ = [
-    "ALGORITHMS", "CONTROLLERS", "PID", "A2CConfig", "Agent", "Checkpoint", "Config",
-    "Controller", "Episode", "EpisodeRecorder", "Geometric", "NetworkPolicy", "PPOConfig", "Policy",
+    "ALGORITHMS", "CONTROLLERS", "PID", "A2CConfig", "Checkpoint", "Config",
+    "Controller", "Episode", "EpisodeRecorder", "Geometric", "PPOConfig", "Policy",
     "ResumeError", "VPGConfig", "find_algorithm", "find_controller", "find_preset", "is_controller",
     "load", "make_agent", "preset", "resume_agent", "store",
 ]  # fmt: skip

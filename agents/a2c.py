@@ -85,7 +85,9 @@ class A2C(Learner):
         `sequences`, and only their kept rows count.
         """
         config = self.config
+        kept: slice | Mask = slice(None)
         if sequences is not None:
+            kept = sequences.kept.ravel()
             inputs = inputs.reshape(-1, *inputs.shape[2:])
             others = tuple(column[sequences.kept] for column in others)
         actions, advantage, targets, *before = others
@@ -94,9 +96,7 @@ class A2C(Learner):
             advantage = advantage - advantage.sum() / count
             advantage /= math.sqrt(advantage.dot(advantage) / (count - 1)) + 1e-8
         found = self._both.forward(inputs.T, sequences)
-        outputs = found
-        if sequences is not None:
-            outputs = found[..., sequences.kept.ravel()]
+        outputs = found[..., kept]
         log_probability, entropy = self._actor.head.score(outputs[0], actions.T)
         gains, weights = self.objective(log_probability, advantage, *before)
         errors = outputs[1, 0] - targets
@@ -105,7 +105,7 @@ class A2C(Learner):
         np.multiply(errors, 2 * config.vf_coef / count, out=slopes[1, 0])
         if sequences is not None:
             found[...] = 0.0
-            found[..., sequences.kept.ravel()] = slopes
+            found[..., kept] = slopes
         self._both.backward(found)
         by_weights = self.weights.slopes
         by_weights *= self._learned
@@ -159,8 +159,7 @@ class A2C(Learner):
         In an update both see the inputs of the critic: weights of inputs that the actor does not
         have stay 0.
         """
-        shapes = {name: array.shape for name, array in self.weights.arrays.items()}
-        learned = Weights.zeros(shapes)
+        learned = Weights.zeros(self._shapes)
         for number, own in enumerate((self._actor.shapes, self._critic.shapes)):
             for array in learned.of_one(number, own).arrays.values():
                 array[...] = 1.0

@@ -33,11 +33,8 @@ from .presets import preset
 FORMAT = 6
 _PLAIN = ("algorithm", "config", "backend", "seed", "env_steps", "versions")
 
-_DTYPES: dict[Any, type[np.generic]] = {int: np.int64, float: np.float64, bool: np.bool_}
-_COLUMNS = {one.name: _DTYPES[one.type] for one in fields(Episode)}
+_COLUMNS = {one.name: one.type for one in fields(Episode)}
 _CHECKSUM = re.compile(rb'"sha256":"([0-9a-f]{64})"')
-_MALFORMED = (LookupError, TypeError, ValueError, AttributeError, RecursionError)
-"""Errors that reading a crafted file can raise."""
 
 
 class CheckpointError(InputError):
@@ -73,11 +70,6 @@ class Checkpoint:
         return self.spec.env_id
 
     @property
-    def options(self) -> dict[str, object]:
-        """Every option of the env."""
-        return dict(self.spec.options)
-
-    @property
     def num_envs(self) -> int:
         """Drones that it trains with; 0 of a policy alone."""
         return len(self.position.flown.numbers) if self.position.flown else 0
@@ -100,12 +92,6 @@ class Checkpoint:
     def policy(self, spec: EnvSpec | None = None) -> NetworkPolicy:
         """The policy, ready to fly that env or its own. Raises `InputError` if it does not fit."""
         return NetworkPolicy.load(self.actor, spec or self.spec, self.hyperparameters)
-
-    def other_versions(self) -> dict[str, tuple[str, str]]:
-        """Software that has another version now: its version then and now."""
-        now = software_versions()
-        pairs = {name: (then, now.get(name, "none")) for name, then in self.versions.items()}
-        return {name: pair for name, pair in pairs.items() if pair[0] != pair[1]}
 
 
 def store(checkpoint: Checkpoint, path: Path) -> None:
@@ -148,7 +134,14 @@ def load(path: Path) -> Checkpoint:
         return _read(path.read_bytes(), numpy.load)
     except InputError as error:
         raise CheckpointError(f"{path}: {error}") from None
-    except (SafetensorError, *_MALFORMED) as error:
+    except (  # what reading a crafted file can raise
+        SafetensorError,
+        LookupError,
+        TypeError,
+        ValueError,
+        AttributeError,
+        RecursionError,
+    ) as error:
         raise CheckpointError(
             f"{path}: expected a rotorgram checkpoint, got one with a wrong part "
             f"({one_line(error):.200})"

@@ -150,12 +150,9 @@ class EpisodeRecorder:
         return flat(self.env.observations, self.spec, self.num_envs)
 
     def start(self) -> None:
-        """As `reset`, unless that was done before."""
-        if self._numbers[0] < 0:
-            self.reset()
-
-    def reset(self) -> None:
-        """Begin the first episode of every drone; training begins now."""
+        """Begin the first episode of every drone, and the training, unless that was done before."""
+        if self._numbers[0] >= 0:
+            return
         self._began = time.perf_counter()
         self._number(np.ones(self.num_envs, bool))
         self.env.reset(seed=self._seeds.tolist())

@@ -55,11 +55,13 @@ class Learner:
         self._both = make_network(seen, actor.actions.outputs, config)
         count = 2 if self.has_critic else 1
         shapes = {**self._both.shapes, **actor.head.shapes}
-        self.weights = Weights.zeros({name: (count, *shape) for name, shape in shapes.items()})
+        self._shapes = {name: (count, *shape) for name, shape in shapes.items()}
+        self.weights = Weights.zeros(self._shapes)
         self._both.bind(self.weights)
         actor.bind(self.weights.of_one(0, actor.shapes))
         rng = np.random.default_rng(weights_seed)
-        actor.initialise(rng, config.log_std)
+        actor.network.initialise(rng, 0.01)  # the first policy gives the middle of the actions
+        actor.head.initialise(config.log_std)
         if self.has_critic:
             self._critic = make_network(seen, 1, config)
             self._critic.bind(self.weights.of_one(1, self._critic.shapes))

@@ -68,8 +68,7 @@ class GRU(Affine):
 
     def forget(self, drones: Mask) -> None:
         """Begin anew in these of the sequences of `state`, shape (B,)."""
-        if drones.size == self.state.shape[-1]:
-            self.state[:, drones] = 0.0
+        self.state[:, drones] = 0.0
 
     def forward(self, inputs: Floats) -> Floats:
         self._inputs = inputs

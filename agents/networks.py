@@ -3,7 +3,6 @@
 Plain arrays enter as they are. A network with a memory carries a state from row to row.
 """
 
-from abc import abstractmethod
 from collections.abc import Sequence
 from typing import ClassVar
 
@@ -20,9 +19,10 @@ _ACTIVATIONS: dict[str, type[Layer]] = {"relu": Relu, "tanh": Tanh}
 
 
 class Network(Chain):
-    """Layers in a row, from inputs (..., n, B) to outputs (..., k, B). Subclasses build the last.
+    """Layers in a row, from inputs (..., n, B) to outputs (..., k, B): an MLP (paper, section 2.3).
 
     Distances and pictures are scaled; then come the encoder and the memory, if it has them.
+    Another kind overrides `build`.
 
     Attributes:
         inputs: Numbers that it sees, n.
@@ -55,9 +55,16 @@ class Network(Chain):
         super().__init__([*layers, *self.build(inputs, outputs, config)])
         self._inputs = np.ones(0, np.float32)
 
-    @abstractmethod
     def build(self, inputs: int, outputs: int, config: Config) -> Sequence[Layer]:
-        """The last layers, which allocate nothing yet."""
+        """The last layers, which allocate nothing yet: `relu` or `tanh` units (paper: one layer of
+        16 `relu`), and linear outputs.
+        """
+        layers: list[Layer] = []
+        activation = _ACTIVATIONS[config.activation]
+        for units in config.hidden:
+            layers += [Affine(inputs, units), activation()]
+            inputs = units
+        return [*layers, Affine(inputs, outputs)]
 
     def forward(self, inputs: Floats, sequences: Sequences | None = None) -> Floats:
         """The outputs; the inputs stay as they are. Of more than n, it sees the first.
@@ -80,25 +87,13 @@ class Network(Chain):
         self.learn(slope)
 
 
-class MLP(Network):
-    """Layers of `relu` or `tanh` units (paper, section 2.3: one of 16) and a linear one."""
-
-    def build(self, inputs: int, outputs: int, config: Config) -> Sequence[Layer]:
-        layers: list[Layer] = []
-        activation = _ACTIVATIONS[config.activation]
-        for units in config.hidden:
-            layers += [Affine(inputs, units), activation()]
-            inputs = units
-        return [*layers, Affine(inputs, outputs)]
-
-
-class CNN(MLP):
+class CNN(Network):
     """An MLP behind convolutions over images and rings."""
 
     convolves = True
 
 
-NETWORKS: dict[str, type[Network]] = {"mlp": MLP, "cnn": CNN}
+NETWORKS: dict[str, type[Network]] = {"mlp": Network, "cnn": CNN}
 """Kinds of networks by the name in a config. A kind of your own is a new entry."""
 
 

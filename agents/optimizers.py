@@ -16,7 +16,7 @@ class Adam:
             the article's moments without the factors 0.1 and 0.001, which the step takes on.
     """
 
-    def __init__(self, weights: Weights, epsilon: float = 1e-8) -> None:
+    def __init__(self, weights: Weights, epsilon: float) -> None:
         self._weights = weights
         self._epsilon = epsilon
         self._sums = np.zeros_like(weights.values)
@@ -53,9 +53,8 @@ class Adam:
         values -= change
 
 
-def clip_norm(slopes: Floats, most: float) -> float:
-    """Scale a gradient down to a norm of at most so much; the norm that it had."""
+def clip_norm(slopes: Floats, most: float) -> None:
+    """Scale a gradient down to a norm of at most so much."""
     norm = math.sqrt(float(slopes.dot(slopes)))
     if norm > most:
         slopes *= most / norm
-    return norm

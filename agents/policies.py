@@ -144,11 +144,6 @@ class NetworkPolicy(Module):
         self.network.bind(weights)
         self.head.bind(weights)
 
-    def initialise(self, rng: np.random.Generator, log_std: float) -> None:
-        """Last layer near zero: the first policy gives the middle of the action space."""
-        self.network.initialise(rng, 0.01)
-        self.head.initialise(log_std)
-
     def reset(self) -> None:
         """Forget the episode, if the network has a memory."""
         if self.memory:
@@ -167,11 +162,3 @@ class NetworkPolicy(Module):
         They hold until the next call. A memory takes them as the next of B episodes.
         """
         return self.network.forward(observations.T).T
-
-    def sample(self, observations: Floats, noise: Floats) -> Floats:
-        """Actions drawn from the policy, float32, shape (N, k), not clipped.
-
-        Shape (N, 1), holding whole numbers, if they are discrete. Observations are flat, shape
-        (N, n); noise is N rows of `head.noise`.
-        """
-        return self.head.sample(self.outputs(observations), noise)

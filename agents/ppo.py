@@ -7,6 +7,7 @@ import numpy as np
 from ..models.fields import Limits, PositiveInt, immutable
 from .a2c import A2C, A2CConfig
 from .config import Positive
+from .episodes import Mask
 from .layers import Floats, views
 from .optimizers import clip_norm
 from .rollouts import Rollout
@@ -56,8 +57,7 @@ class PPO(A2C):
         if critic_rate is None:
             return None
         scales = np.ones_like(self.weights.values)
-        shapes = {name: array.shape for name, array in self.weights.arrays.items()}
-        for array in views(scales, shapes).values():
+        for array in views(scales, self._shapes).values():
             array[1] = critic_rate / self.config.learning_rate
         return scales
 
@@ -74,7 +74,7 @@ class PPO(A2C):
             choices = np.flatnonzero(rollout.kept.any(axis=0))
         minibatches = min(config.minibatches, len(choices))
         self._changes: list[Floats] = []
-        terms: list[tuple[float, ...]] = []
+        terms = []
         for _ in range(config.epochs):
             order = self._rng.permutation(choices)
             for chosen in np.array_split(order, minibatches):
@@ -118,3 +118,25 @@ class PPO(A2C):
         np.minimum(np.maximum(ratio, 1 - clip, out=ratio), 1 + clip, out=ratio)
         ratio *= advantage
         return np.minimum(gains, ratio), gains * (gains <= ratio)
+
+
+class MAPPO(PPO):
+    """PPO with a central critic: Yu et al. 2022, arXiv 2103.01955. Drones share parameters.
+
+    The critic sees all drones of a world, and is needed in training alone.
+
+    To judge a drone it sees that drone's observation and then those of the others, from the next
+    one on by their names; zeros for a drone that is out. The actor sees what its drone sees, as
+    PPO's.
+    """
+
+    central = True
+
+    def seen(self, observations: Floats, flying: Mask) -> Floats:
+        """Inputs of the critic, shape (T, N, A·n), as `A2C.seen`."""
+        count = len(self.spec.agents)
+        steps, rows, size = observations.shape
+        worlds = observations.reshape(steps, -1, count, size)
+        there = worlds * flying.reshape(steps, -1, count, 1)
+        others = [np.roll(there, -next_one, axis=2) for next_one in range(1, count)]
+        return np.concatenate([worlds, *others], axis=-1).reshape(steps, rows, -1)

@@ -5,7 +5,7 @@ Time is the first axis, drones may be the second: arrays have the shape (T, ...)
 truncation and never over a termination; a recursion stops at either, and at the last row.
 """
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,6 +32,8 @@ class Rollout:
     Recursions over time may run through the rest, for an episode ends before each.
     """
 
+    state: Floats
+    """Of the policy's memory before the first row, shape (H, N)."""
     observations: Floats
     """Shape (T, N, n)."""
     actions: Floats
@@ -44,8 +46,6 @@ class Rollout:
     """Shape (T, N), as the following."""
     truncated: Mask
     kept: Mask
-    state: Floats = field(default_factory=lambda: np.zeros((0, 0), np.float32))
-    """Of the policy's memory before the first row, shape (H, N)."""
 
     def __len__(self) -> int:
         return int(self.kept.sum())
@@ -84,7 +84,8 @@ class Rollout:
 
     def without_episodes(self, lost: Mask) -> "Rollout":
         """Without the episodes that end with such a step: their returns are unknown."""
-        return replace(self, kept=self.kept & (rewards_to_go(lost, self.ends, 1.0) == 0))
+        losses = discounted_sums(lost, ~self.ends)
+        return replace(self, kept=self.kept & (losses == 0))
 
 
 @dataclass
@@ -115,7 +116,7 @@ class Collector:
         log = self.log
         rounds = -(-count // log.num_envs)
         last = log.env_steps + most_steps
-        flown: list[Rollout] = []
+        flown = []
         while rounds and log.env_steps < last:
             rollout, lost, done = self._fly(None, last - log.env_steps)
             rollout = rollout.without_episodes(lost)
@@ -148,7 +149,8 @@ class Collector:
             if not len(rows) % block:
                 drawn = self.policy.head.noise(self.rng, block * count)
                 noise = drawn.reshape(block, count, -1)
-            actions = self.policy.sample(observations, noise[len(rows) % block])
+            outputs = self.policy.outputs(observations)
+            actions = self.policy.head.sample(outputs, noise[len(rows) % block])
             if not np.isfinite(actions).all():
                 raise Diverged("actions are not finite")
             flying = ~log.out
@@ -173,8 +175,7 @@ class Collector:
         if waiting and (stop is None or waiting == count):
             log.begin(log.done)
         *columns, lost = (np.array(column) for column in zip(*rows, strict=True))
-        rollout = replace(Rollout(*columns), state=state)
-        return rollout, lost, waiting == count
+        return Rollout(state, *columns), lost, waiting == count
 
 
 def discounted_sums(values: Array, factors: Array) -> Numbers:
@@ -192,14 +193,6 @@ def discounted_sums(values: Array, factors: Array) -> Numbers:
         factors[-span:] = 0.0
         span *= 2
     return sums
-
-
-def rewards_to_go(rewards: Array, ends: Mask, gamma: float) -> Numbers:
-    """R_t = sum of gamma^(t' - t) · r_t' to the episode's end (paper, Algorithm 1, step 2).
-
-    Arrays have shape (T, N), as the result; `ends` is bool.
-    """
-    return discounted_sums(rewards, gamma * ~ends)
 
 
 def advantages(
@@ -226,8 +219,7 @@ def advantages(
 
 def step_of_episode(ends: Mask) -> NDArray[np.int64]:
     """Number of each step within its episode, where the first row begins at 0."""
-    others = (1,) * (ends.ndim - 1)
-    index = np.arange(len(ends)).reshape(-1, *others)
-    starts = np.zeros(ends.shape, int)
-    starts[1:] = np.where(ends[:-1], index[1:], 0)
-    return index - np.maximum.accumulate(starts)
+    goes_on = np.roll(~ends, 1, axis=0)
+    # The sum of ones backward in time: it counts the steps up to each.
+    steps = discounted_sums(np.ones(ends.shape), goes_on[::-1])[::-1]
+    return steps.astype(int) - 1

@@ -51,7 +51,6 @@ class SB3VecEnv(sb3_vec.VecEnv):
         self.env = env
         self.render_mode = None
         super().__init__(env.num_envs, env.single_observation_space, env.single_action_space)
-        self._actions = np.zeros(0)
 
     def reset(self) -> VecEnvObs:
         """Begin an episode for every env, with the seeds of `seed` if it was called."""
@@ -116,8 +115,8 @@ class RecordedEnv(VectorEnv[Floats, Floats, np.ndarray]):
         self.single_action_space = spaces.Discrete(actions.outputs) if actions.discrete else box
 
     def reset(self, **_: object) -> tuple[Floats, dict[str, Any]]:
-        """Begin an episode of every drone; arguments are not used."""
-        self.recorder.reset()
+        """Begin the first episode of every drone, once; arguments are not used."""
+        self.recorder.start()
         return self.recorder.observations, {}
 
     def step(self, actions: Floats) -> Step:
@@ -169,7 +168,6 @@ class SB3Agent:
         self._rate = config.learning_rate
         self._rollout = config.rollout_size(log.num_envs)
         torch.set_num_threads(1)  # a second thread slows such small nets
-        steps = self._rollout // log.num_envs
         policy: Settings = {
             "net_arch": list(config.hidden),
             "activation_fn": {"relu": torch.nn.ReLU, "tanh": torch.nn.Tanh}[config.activation],
@@ -190,7 +188,7 @@ class SB3Agent:
             policy_kwargs=policy,
             seed=seeds_of(seed)[0] % 2**32,
             device="cpu",
-            **_settings(config, steps, log),
+            **_settings(config, self._rollout, log),
         )
         if isinstance(config, PPOConfig) and config.critic_learning_rate:
             self._set_rate_of_critic(config.critic_learning_rate / config.learning_rate)
@@ -260,8 +258,9 @@ class SB3Agent:
 _MODELS: dict[type, Any] = {A2CConfig: sb3.A2C, PPOConfig: sb3.PPO, SACConfig: sb3.SAC}
 
 
-def _settings(config: A2CConfig | SACConfig, steps: int, log: EpisodeRecorder) -> Settings:
+def _settings(config: A2CConfig | SACConfig, rollout: int, log: EpisodeRecorder) -> Settings:
     """Settings of SB3's that not all of its algorithms have."""
+    steps = rollout // log.num_envs
     if isinstance(config, SACConfig):
         if log.actions.discrete:
             raise InputError("sb3-sac: expected an env of continuous actions, got one of choices")
@@ -274,7 +273,6 @@ def _settings(config: A2CConfig | SACConfig, steps: int, log: EpisodeRecorder) -
             "gradient_steps": config.gradient_steps,
             "ent_coef": f"auto_{config.alpha}",
         }
-    rollout = steps * log.num_envs
     settings: Settings = {
         "n_steps": steps,
         "gae_lambda": config.gae_lambda,

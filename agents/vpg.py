@@ -9,7 +9,7 @@ from ..models.fields import PositiveInt, immutable
 from .config import Config
 from .layers import Floats
 from .learner import Learner
-from .rollouts import Collector, Rollout, rewards_to_go, step_of_episode
+from .rollouts import Collector, Rollout, discounted_sums, step_of_episode
 
 
 @immutable
@@ -64,7 +64,8 @@ class VPG(Learner):
 
     def returns(self, rollout: Rollout) -> Floats:
         """R_t minus the baseline, scaled if `normalize`, shape (rows,)."""
-        sums = rewards_to_go(rollout.rewards, rollout.ends, self.config.gamma)
+        # The sum of gamma^(t' - t) · r_t' to the episode's end (Algorithm 1, step 2).
+        sums = discounted_sums(rollout.rewards, self.config.gamma * ~rollout.ends)
         returns = rollout.rows(sums)
         if self.config.baseline == "time":
             step = rollout.rows(step_of_episode(rollout.ends))

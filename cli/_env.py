@@ -81,7 +81,7 @@ def fitted(command: F, checkpoint: Pilot) -> F:
                 f"env: expected --env {checkpoint.env_id} with options of the task that the "
                 f"policy was trained on, got {', '.join(sorted(foreign))} of {env_id}"
             )
-    options = {**checkpoint.options, **options}
+    options = {**checkpoint.spec.options, **options}
     changes: Options = {"env": checkpoint.env_id, "options": options}
     if "drones" not in command.given:
         changes["drones"] = len(checkpoint.spec.agents)

@@ -19,7 +19,7 @@ from ..envs.config import BackendConfig
 from ..flights.folders import locked
 from ..models import Backend, InputError
 from ..models.errors import require
-from ..models.files import software_versions, write_json, write_whole
+from ..models.files import other_versions, software_versions, write_json, write_whole
 from ..training.settings import Run
 from ..training.training import Training, config_of, is_finished
 from ._env import CHECKPOINT, fitted, local_env, remote_env
@@ -98,7 +98,7 @@ def resume(command: "Train", folder: Path) -> int:
             print(f"already trained {kept.position.env_steps:,} of {kept.env_steps:,} env steps")
             print(f"checkpoint: {folder / CHECKPOINT}")
             return 0
-        for name, (then, now) in kept.other_versions().items():
+        for name, (then, now) in other_versions(kept.versions).items():
             print(f"note: {name} was {then} and is {now}: the numbers may differ")
         backend = kept.env.backend if kept.env else kept.backend
         with _opened(fitted(command, kept), kept.num_envs, backend) as env:

@@ -154,8 +154,6 @@ def open_executor(
 class _ThisProcess(Executor):
     """Does a job when it is submitted."""
 
-    workers = 1
-
     def __init__(self, on_progress: OnProgress) -> None:
         _Worker.report = on_progress
 
@@ -176,7 +174,8 @@ class _Processes(ProcessPoolExecutor):
         # Nothing is sent through this pipe: its end says that the main process is gone.
         ends, self._alive = context.Pipe(duplex=False)
         progress, self._writer = context.Pipe(duplex=False)
-        self._before = {name: os.environ.get(name) for name in _CHILD_ENVIRONMENT}
+        names = _CHILD_ENVIRONMENT.keys() & os.environ.keys()
+        self._before = {name: os.environ[name] for name in names}
         os.environ.update(_CHILD_ENVIRONMENT)
         arguments = (ends, self._writer, context.Lock())
         super().__init__(workers, context, initializer=_begin_worker, initargs=arguments)
@@ -186,11 +185,9 @@ class _Processes(ProcessPoolExecutor):
         self._alive.close()  # workers end, and with them their simulators
         self._writer.close()  # with the last worker's, so `_pass_on` ends
         super().shutdown(wait=wait, cancel_futures=cancel_futures)
-        for name, value in self._before.items():
-            if value is None:
-                os.environ.pop(name, None)
-            else:
-                os.environ[name] = value
+        for name in _CHILD_ENVIRONMENT:
+            os.environ.pop(name, None)
+        os.environ.update(self._before)
 
 
 def _pass_on(progress: Connection, on_progress: OnProgress) -> None:

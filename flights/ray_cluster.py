@@ -7,7 +7,7 @@ from concurrent.futures import Executor, Future
 from typing import TypeVar
 
 from ..models.errors import InputError, one_line, require
-from ..models.files import software_versions
+from ..models.files import other_versions, software_versions
 
 _Value = TypeVar("_Value")
 _LISTENING_TIMEOUT = 5.0  # s
@@ -57,12 +57,9 @@ def _with_same_software(
     versions: dict[str, str], function: Callable[..., _Value], *args: object
 ) -> _Value:
     """Call a function; `config.json` names one version of each package. (In a worker.)"""
-    own = software_versions()
-    for package in {**versions, **own}:
-        there, here = versions.get(package, "none"), own.get(package, "none")
-        if here != there:
-            raise InputError(
-                f"{package}: expected version {there} as on the machine of the "
-                f"command, got {here} on {socket.gethostname()}"
-            )
+    for package, (there, here) in other_versions(versions).items():
+        raise InputError(
+            f"{package}: expected version {there} as on the machine of the "
+            f"command, got {here} on {socket.gethostname()}"
+        )
     return function(*args)

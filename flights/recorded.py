@@ -35,7 +35,7 @@ def recorded_trajectories(
         InputError: It is no journal, or has no such session, drone or episode.
         OSError: It cannot be read.
     """
-    sessions: list[Session] = []
+    sessions = []
     found: Flights = []
     for one in read_episodes(path, drone, observations=observations):
         if isinstance(one, Session):

@@ -8,7 +8,7 @@ import os
 import platform
 import shutil
 import tomllib
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from functools import cache
 from pathlib import Path
@@ -44,7 +44,7 @@ def parse_toml(content: str | bytes, what: str, name: str = "a text") -> dict[st
 
 def read_own_toml(module: str, name: str) -> dict[str, Any]:
     """Tables of a file of ours beside a module: `read_own_toml(__file__, "rules")`."""
-    return read_toml(Path(module).with_name(f"{name}.toml"), name)
+    return read_toml(Path(module).parent / f"{name}.toml", name)
 
 
 @contextmanager
@@ -116,3 +116,10 @@ def software_versions() -> dict[str, str]:
         with suppress(PackageNotFoundError):
             versions[name] = version(name)
     return versions
+
+
+def other_versions(then: Mapping[str, str]) -> dict[str, tuple[str, str]]:
+    """Software that has another version now: its version then and now, "none" where it is not."""
+    now = software_versions()
+    pairs = {name: (then.get(name, "none"), now.get(name, "none")) for name in {**then, **now}}
+    return {name: pair for name, pair in pairs.items() if pair[0] != pair[1]}

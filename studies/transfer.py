@@ -124,7 +124,7 @@ def made(count: int, vehicle: str, options: Mapping[str, object]) -> LocalVector
 def measure(shift: Shift, path: Path | None, seed: int) -> dict[str, float]:
     """Error and share of crashes of a policy's file, or of the controller without one."""
     kept = load(path) if path else None
-    own = {"history": kept.options["history"]} if kept else Geometric.options
+    own = {"history": kept.spec.options["history"]} if kept else Geometric.options
     env = made(EPISODES, shift.vehicle, {**shift.options, **own})
     policy = kept.policy(env.env_spec) if kept else Geometric(env.env_spec)
     flown = fly_episodes(env, policy, EPISODES, "final", training_seed=seed)

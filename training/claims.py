@@ -16,15 +16,14 @@ on the good side of it.
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Literal
 
 import numpy as np
 from pandas import DataFrame, Series
 
-from ..models.files import read_toml
+from ..models.files import read_own_toml
 from .metrics import Headline, episode_ends, mean_returns, training_runs
-from .statistics import Floats, bootstrap_difference, iqm, share_interval
+from .statistics import Floats, bootstrap_difference, finite, iqm, share_interval
 from .tables import seeds_text
 
 MIN_SEEDS = 30
@@ -60,7 +59,7 @@ FLUCTUATION_WINDOW = 11
 _GRID = 100
 
 _TOO_FEW = f"fewer than {MIN_SEEDS} seeds with a value decide nothing"
-_TEXTS = read_toml(Path(__file__).parent / "assets" / "claims.toml", "claims")
+_TEXTS = read_own_toml(__file__, "assets/claims")
 _NUMBERS = {
     "smoothing": 100 * SMOOTHING_SHARE,
     "band": 100 * CONVERGENCE_BAND,
@@ -120,7 +119,7 @@ def convergence_step(run: DataFrame) -> float:
     if level[-1] - level[begin] <= LEARNING_RISE * level[steps > 0.75 * ends[-1]].std():
         return np.nan
     away = np.abs(level - level[-1]) > CONVERGENCE_BAND * np.ptp(level)
-    start = int(away.nonzero()[0][-1]) + 1 if away.any() else 0
+    start = away.nonzero()[0].max(initial=-1) + 1
     return float(steps[start])
 
 
@@ -141,22 +140,20 @@ def fluctuation(run: DataFrame) -> float:
 
 
 def judge_claims(episodes: DataFrame, runs: DataFrame, headline: Headline) -> list[Verdict]:
-    """Judge the paper's four claims from the tables `episodes` and `runs` of `results`."""
+    """Judge the paper's four claims from the tables `episodes` and `runs` of `results`, and then
+    whether our A2C is no worse than SB3's after as many env steps.
+
+    The headline metric has a bound of its goal.
+    """
     converges = _compare(episodes, convergence_step, True, " env steps", "did not converge")
     judged = {
         "converges": converges,
         "reward": _compare(episodes, long_run_return, True),
         "fluctuates": _compare(episodes, fluctuation, False),
         "holds": _both_hold(runs, headline),
+        "no_worse": _no_worse(runs, headline),
     }
     return [_verdict(name, headline, outcome) for name, outcome in judged.items()]
-
-
-def judge_no_worse(runs: DataFrame, headline: Headline) -> Verdict:
-    """Judge whether our A2C is no worse than SB3's after as many env steps, from the table `runs`.
-    The headline metric has a bound of its goal.
-    """
-    return _verdict("no_worse", headline, _no_worse(runs, headline))
 
 
 def _verdict(name: str, headline: Headline, judged: _Judged) -> Verdict:
@@ -186,16 +183,16 @@ def _compare(
     missing = [name for name, own in runs.items() if not own]
     if missing:
         return "not tested", _untrained(missing)
-    values: list[Floats] = []
+    values = []
     parts = []
     for name, own in runs.items():
         numbers = np.array([measure(run) for run in own])
-        known = np.isfinite(numbers)
-        details = _seeds(int(known.sum()), len(own))
-        failed = sum(len(run) >= MIN_EPISODES for run in own) - int(known.sum())
+        known = finite(numbers).size
+        details = _seeds(known, len(own))
+        failed = sum(len(run) >= MIN_EPISODES for run in own) - known
         if without and failed:
             details += f", {failed} {without}"
-        parts.append(f"{name} {_number(iqm(numbers))}{unit if known.any() else ''} ({details})")
+        parts.append(f"{name} {_number(iqm(numbers))}{unit if known else ''} ({details})")
         values.append(numbers)
     evidence = f"{', '.join(parts)}; "
     if _are_few(values):
@@ -209,11 +206,11 @@ def _compare(
 
 def _are_few(values: Sequence[Floats]) -> bool:
     """Whether an agent has too few seeds with a value."""
-    return min(int(np.isfinite(numbers).sum()) for numbers in values) < MIN_SEEDS
+    return min(finite(numbers).size for numbers in values) < MIN_SEEDS
 
 
 def _both_hold(runs: DataFrame, headline: Headline) -> _Judged:
-    outcomes: list[Outcome] = []
+    outcomes = []
     texts = []
     for name in ("a2c", "vpg"):
         outcome, text = _holds(runs[runs["row"] == name], headline)

@@ -65,7 +65,7 @@ def draw_figures(results: Results, table: DataFrame) -> list[str]:
     target.mkdir(exist_ok=True)
     rows = [row for row in results.study.rows if row.name in table.index]
     tasks = by_task(results, rows)
-    figures: dict[str, Figure] = {}
+    figures = {}
     with style.context(_STYLE):
         for task, own in tasks:
             name = "comparison" if len(tasks) == 1 else f"comparison_{file_words(task)}"

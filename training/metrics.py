@@ -14,14 +14,14 @@ from math import nan
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from pandas import DataFrame, Series
 
 from ..envs.spec import EnvSpec, Metric
 from ..flights.trajectories import Trajectory
 from ..models.errors import InputError
 from ..models.fields import immutable
-from .statistics import Floats, Values, trimmed_mean
+from .statistics import Floats, trimmed_mean
 
 Places = NDArray[np.int64]
 Measures = dict[str, float]
@@ -91,12 +91,11 @@ class Headline(Metric):
         sign = "≥" if self.high else "<"
         return f"{self.size_symbol} {sign} {self.amount(f'{self.held:g}')}"
 
-    def size(self, values: Values) -> Floats:
-        """Sizes of some values; same shape, float64."""
-        array = np.asarray(values, float)
-        return array if self.high else np.abs(array)
+    def size(self, values: Floats) -> Floats:
+        """Sizes of some values, of the same shape."""
+        return values if self.high else np.abs(values)
 
-    def holds(self, sizes: Values) -> NDArray[np.bool_]:
+    def holds(self, sizes: ArrayLike) -> NDArray[np.bool_]:
         """Whether each mean size counts as holding the goal; false for nan, or without a bound."""
         array = np.asarray(sizes, float)
         bound = np.nan if self.held is None else self.held  # no number is above or below nan
@@ -116,39 +115,37 @@ class Headline(Metric):
 # ---- over an episode
 
 
-def steady_state(sizes: Values, *, final: bool = False) -> float:
+def steady_state(sizes: Floats, *, final: bool = False) -> float:
     """Mean of the last quarter of an episode's sizes, (T,), at least of the last; nan if T = 0.
 
     Of a `final` metric only the last counts.
     """
     count = 1 if final else max(1, len(sizes) // 4)
-    last = np.asarray(sizes, float)[-count:]
+    last = sizes[-count:]
     return float(last.mean()) if last.size else nan
 
 
-def settling_time(errors: Values, control_period: float, tolerance: float) -> float:
+def settling_time(errors: Floats, control_period: float, tolerance: float) -> float:
     """Time from which the error stays inside the tolerance until the episode ends, s; nan if never.
 
     The metric is given at every control step, shape (T,), the first at time 0; the tolerance is the
     half width of the band around zero, in the metric's unit, and the control period in s.
     """
-    outside = ~(np.abs(np.asarray(errors, float)) < tolerance)
+    outside = ~(np.abs(errors) < tolerance)
     if outside.size == 0 or outside[-1]:
         return nan
-    if not outside.any():
-        return 0.0
-    return float(outside.nonzero()[0][-1] + 1) * control_period
+    last = outside.nonzero()[0].max(initial=-1)
+    return float(last + 1) * control_period
 
 
-def overshoot(errors: Values) -> float:
+def overshoot(errors: Floats) -> float:
     """How far the craft passed its target: the largest -sign(E_0)·E of shape (T,), at least 0.
 
     An episode that begins on its target has the largest |E|; one without steps has nan.
     """
-    values = np.asarray(errors, float)
-    if not values.size:
+    if not errors.size:
         return nan
-    passed = -np.sign(values[0]) * values if values[0] else np.abs(values)
+    passed = -np.sign(errors[0]) * errors if errors[0] else np.abs(errors)
     return max(0.0, float(passed.max()))
 
 
@@ -159,7 +156,7 @@ def measure_episode(trajectory: Trajectory, headline: Headline) -> Measures:
     """
     values = trajectory.headline
     steady = steady_state(headline.size(values[1:]), final=headline.final)
-    reached = headline.final and bool(headline.holds([steady])[0])
+    reached = headline.final and bool(headline.holds(steady))
     settled = nan
     if headline.settles and (reached or not trajectory.terminated):
         settled = settling_time(values, trajectory.spec.control_period, headline.settled or 0.0)
@@ -203,7 +200,7 @@ def measure_run(evaluations: DataFrame, headline: Headline) -> Measures:
         "episodes": len(final),
         "settled": int(final["settling_time"].notna().sum()),
         "crashed": int(crashed.sum()),
-        "held": int(safe and whole and bool(headline.holds([means["steady"]])[0])),
+        "held": int(safe and whole and bool(headline.holds(means["steady"]))),
         "env_steps_to_hold": steps,
         "seconds_to_hold": seconds,
     }

@@ -13,7 +13,7 @@ import pandas as pd
 from markdown_it import MarkdownIt
 
 from ..models.errors import require
-from .claims import Verdict, judge_claims, judge_no_worse
+from .claims import Verdict, judge_claims
 from .figures import PAPER, draw_figures
 from .results import Results
 from .tables import markdown, results_table
@@ -58,8 +58,7 @@ def judge(results: Results) -> list[Verdict]:
     if results.study.kind != "paper" or results.runs.empty:
         return []
     headline = results.headline(results.study.rows[0])
-    verdicts = judge_claims(results.episodes, results.runs, headline)
-    return [*verdicts, judge_no_worse(results.runs, headline)]
+    return judge_claims(results.episodes, results.runs, headline)
 
 
 def _head(results: Results) -> str:

@@ -24,64 +24,30 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
 import pandas as pd
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from ..envs.spec import EnvSpec, SpecError
+from ..envs.spec import EnvSpec
 from ..models.errors import InputError
-from ..models.files import software_versions, write_json, write_whole
+from ..models.files import read_own_toml, software_versions, write_json, write_whole
 from .metrics import Headline
 from .settings import Row, Study, file_words
 
 CONFIG_FILE = "config.json"
 CHECKPOINTS = "checkpoints"
 
-COLUMNS: Final[Mapping[str, tuple[str, ...]]] = {
-    "runs": (
-        "row", "seed", "env_steps", "seconds", "steps_per_second",
-        "steady", "settling_time", "overshoot", "return", "episodes", "settled", "crashed", "held",
-        "env_steps_to_hold", "seconds_to_hold",
-    ),
-    "evaluations": (
-        "row", "seed",
-        "env_steps", "seconds",  # of training behind the snapshot; s of wall time
-        "episode", "length", "return",
-        "steady",  # mean size in the last quarter
-        "settling_time",  # s; missing if the error never settled
-        "overshoot",  # missing if the metric has no sign
-        "terminated",
-    ),
-    "episodes": (
-        "row", "seed", "episode",
-        "first_step", "last_step",  # env steps of the run, of all drones, at start and end
-        "length", "return",
-        "mean_size",  # mean size of the metric
-        "terminated", "truncated",
-        "seconds",  # training wall time when the episode ended
-    ),
-    "steps": (
-        "row", "seed",
-        "phase",  # "train" or "evaluation"
-        "episode",  # within the run; -1: one that the end of training cut
-        "step",  # of the run for train, of the episode for evaluation; from 1
-        "value",
-    ),
-}  # fmt: skip
-"""Columns of each table.
+COLUMNS = read_own_toml(__file__, "assets/tables")
+"""Columns of each table: what each holds, by its name.
 
 `evaluations` may have more, of what was drawn.
 """
 
 Tables = Mapping[str, pd.DataFrame]
 """Tables by name."""
-
-
-class ResultsError(InputError):
-    """A file of results is missing or is not what it should be."""
 
 
 # ---- writing
@@ -104,7 +70,7 @@ def write_config(folder: Path, command: str, study: Study, specs: Mapping[str, E
 
 
 def check_unchanged(folder: Path, study: Study, specs: Mapping[str, EnvSpec]) -> None:
-    """Raise `ResultsError` for a row that is no more what it was when the study began."""
+    """Raise `InputError` for a row that is no more what it was when the study began."""
     begun = Results.read(folder)
     sources = begun.config.get("sources", {})
     for row in study.rows:
@@ -114,7 +80,7 @@ def check_unchanged(folder: Path, study: Study, specs: Mapping[str, EnvSpec]) ->
         elif row.source_hash != sources.get(row.name):
             changed = row.agent
         if changed:
-            raise ResultsError(
+            raise InputError(
                 f"resume: {row.name}: expected the {changed} with which {folder} began, got another"
             )
 
@@ -145,7 +111,7 @@ def run_file(folder: Path, row: Row, seed: int, table: str = "runs") -> Path:
 
 def write_run(folder: Path, row: Row, seed: int, tables: Tables) -> None:
     """Write what one run gave; the table `runs` last."""
-    for name in reversed(tuple(COLUMNS)):
+    for name in reversed(COLUMNS):
         if name in tables and len(tables[name]):  # columns of an empty table have no type
             table = tables[name].copy()
             table.insert(0, "row", row.name)
@@ -161,7 +127,7 @@ def write_run(folder: Path, row: Row, seed: int, tables: Tables) -> None:
 class Results:
     """The folder of a study; its tables are read when they are asked for.
 
-    Raises `ResultsError` for a file that is missing or not what it should be.
+    Raises `InputError` for a file that is missing or not what it should be.
     """
 
     folder: Path
@@ -172,21 +138,21 @@ class Results:
     """Of each row's env, by the row's name."""
 
     @classmethod
-    def read(cls, folder: Path | str) -> "Results":
-        """Raises `ResultsError`."""
-        path = Path(folder) / CONFIG_FILE
+    def read(cls, folder: Path) -> "Results":
+        """Raises `InputError`."""
+        path = folder / CONFIG_FILE
         if not path.is_file():
-            raise ResultsError(f"{folder}: expected the folder of a study, there is no {path}")
+            raise InputError(f"{folder}: expected the folder of a study, there is no {path}")
         try:
             config = json.loads(path.read_text(encoding="utf-8"))
             study = Study.from_dict(f"{path}: study", config["study"])
             specs = {
                 name: EnvSpec.from_json(json.dumps(spec)) for name, spec in config["specs"].items()
             }
-        except (AttributeError, KeyError, TypeError, ValueError, SpecError) as error:
+        except (AttributeError, KeyError, TypeError, ValueError) as error:
             text = str(error) if isinstance(error, InputError) else repr(error)
-            raise ResultsError(f"{path}: expected the settings of a study, got: {text}") from None
-        return cls(folder=Path(folder), config=config, study=study, specs=specs)
+            raise InputError(f"{path}: expected the settings of a study, got: {text}") from None
+        return cls(folder=folder, config=config, study=study, specs=specs)
 
     def headline(self, row: Row) -> Headline:
         """The metric that decides in the row's env."""
@@ -232,10 +198,10 @@ class Results:
         try:
             table = pd.concat(map(pd.read_parquet, files), ignore_index=True)
         except pa.ArrowInvalid as error:
-            raise ResultsError(f"{files[0].parent}: expected Parquet files, got: {error}") from None
+            raise InputError(f"{files[0].parent}: expected Parquet files, got: {error}") from None
         missing = [column for column in COLUMNS[name] if column not in table]
         if missing:
-            raise ResultsError(
+            raise InputError(
                 f"{files[0].parent}: expected the columns {', '.join(COLUMNS[name])}, "
                 f"got no {', '.join(missing)}"
             )

@@ -190,7 +190,7 @@ class Row:
 
     def to_dict(self) -> dict[str, object]:
         """JSON values that `from_dict` reads."""
-        return {**vars(self), "set": dict(self.set), "env": self.env.keywords()}
+        return {**vars(self), "env": self.env.keywords()}
 
     @classmethod
     def from_dict(cls, where: str, table: object, env: Mapping[str, object] | None = None) -> "Row":

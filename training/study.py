@@ -5,7 +5,6 @@ from contextlib import AbstractContextManager, closing
 from dataclasses import fields, replace
 from functools import partial
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -33,11 +32,8 @@ Job = tuple[Row, int]
 """A row and a seed."""
 
 
-class Done(NamedTuple):
-    """What a run gives."""
-
-    tables: results.Tables
-    checkpoint: Checkpoint | None
+Done = tuple[results.Tables, Checkpoint | None]
+"""What a run gives: a controller has no checkpoint."""
 
 
 def run_study(
@@ -85,12 +81,12 @@ def run_study(
 def _keep(study: Study, folder: Path, job: Job, done: Done) -> None:
     """Write checkpoint and tables; these last, for with them the run is done."""
     row, seed = job
-    checkpoint = done.checkpoint
+    tables, checkpoint = done
     if study.kind == "benchmark" and checkpoint:  # none is chosen: the first seed's policy
         checkpoint = checkpoint.policy_alone() if seed == study.first_seed else None
     if checkpoint and study.kind != "sweep":
         store(checkpoint, results.checkpoint_file(folder, row, seed))
-    results.write_run(folder, row, seed, done.tables)
+    results.write_run(folder, row, seed, tables)
 
 
 # ---- in a worker
@@ -103,7 +99,7 @@ def _fly(study: Study, own_tasks: set[str], job: Job, tell: Tell) -> Done:
     if row.controller:
         policy = find_controller(row.agent)(env_spec(row.env))
         untrained = [Snapshot(env_steps=0, seconds=0.0, policy=policy)]
-        return Done(_evaluate(study, row, seed, untrained), None)
+        return _evaluate(study, row, seed, untrained), None
     run = row.run(seed)
     with open_env(study.wire, run.env, run.num_envs) as env:
         training = Training(run, env, snapshots=study.snapshots, keep_steps=study.keep_steps)
@@ -114,7 +110,7 @@ def _fly(study: Study, own_tasks: set[str], job: Job, tell: Tell) -> Done:
     if study.keep_steps:
         flown = _steps("train", **training.log.steps())
         tables["steps"] = pd.concat([flown, tables["steps"]], ignore_index=True)
-    return Done(tables, training.checkpoint())
+    return tables, training.checkpoint()
 
 
 def open_env(
@@ -140,9 +136,7 @@ def _evaluate(
     flown: list[Trajectory] = []
     drones = row.env.drones
     final = snapshots[-1]
-    most = study.episodes
-    if len(snapshots) > 1:
-        most = max(most, study.curve_episodes)
+    most = max(study.episodes, study.curve_episodes)
     worlds = min(most, max(MAX_BATCH // drones, 1))
     with open_env(study.wire, row.env.unseen(), worlds * drones) as env:
         headline = Headline.of(env.env_spec)
@@ -171,7 +165,7 @@ def _episodes(training: Training) -> pd.DataFrame:
     last = table["first_step"] + table["length"] * log.num_envs
     table = table.assign(last_step=last.clip(upper=log.env_steps))
     table = table.rename(columns={"total_reward": "return"})
-    return table[list(results.COLUMNS["episodes"][2:])]
+    return table[list(results.COLUMNS["episodes"])[2:]]
 
 
 def _steps(phase: str, episode: ArrayLike, value: ArrayLike) -> pd.DataFrame:

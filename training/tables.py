@@ -38,7 +38,7 @@ def results_table(results: Results) -> DataFrame:
     The rows of a sweep are ranked: whole rows first, then by the crashes of the worst seed, then by
     its steady state. Other rows keep their order.
     """
-    lines: dict[str, Measures] = {}
+    lines = {}
     for row in results.study.rows:
         own = results.runs[results.runs["row"] == row.name]
         if len(own):

@@ -3,7 +3,7 @@
 import time
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING
 
@@ -73,15 +73,13 @@ class Training:
     snapshots: int = 0
     keep_steps: bool = False
     kept: Checkpoint | None = None
-    taken: list[Snapshot] = field(default_factory=list, init=False)
 
     def __post_init__(self) -> None:
-        wanted = self.run.num_envs
-        if self.env.num_envs != wanted:
-            raise InputError(f"env: expected one of {wanted} drones, got {self.env.num_envs}")
-        self.log = agents.EpisodeRecorder(self.env, self.run.seed, keep_steps=self.keep_steps)
         run = self.run
-        self.agent: agents.Agent
+        if self.env.num_envs != run.num_envs:
+            raise InputError(f"env: expected one of {run.num_envs} drones, got {self.env.num_envs}")
+        self.taken: list[Snapshot] = []
+        self.log = agents.EpisodeRecorder(self.env, run.seed, keep_steps=self.keep_steps)
         if self.kept:
             self.agent = agents.resume_agent(self.kept, self.log)
         else:
@@ -162,7 +160,7 @@ class Training:
         """
         log = self.log
         numbers = {
-            "time/total_timesteps": float(log.env_steps),
+            "time/total_timesteps": log.env_steps,
             "time/fps": log.env_steps / log.seconds if log.seconds else np.nan,
             **self.agent.scalars(),
         }
@@ -201,6 +199,6 @@ class Training:
     def _take(self) -> None:
         log = self.log
         if self.snapshots:
-            seconds = log.seconds
             policy = self.agent.policy()
-            self.taken.append(Snapshot(env_steps=log.env_steps, seconds=seconds, policy=policy))
+            taken = Snapshot(env_steps=log.env_steps, seconds=log.seconds, policy=policy)
+            self.taken.append(taken)

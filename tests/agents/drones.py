@@ -34,7 +34,8 @@ def rollout(name: str = "three steps", **changes: np.ndarray) -> Rollout:
     never = np.zeros(len(table["rewards"]), bool)
     flags = {"truncated": never, "kept": ~never, "terminated": table.pop("terminated") == 1}
     rewards = table.pop("rewards").astype(float)
-    columns = {**table, **flags, "rewards": rewards, **changes}
+    state = np.zeros(0, np.float32)
+    columns = {"state": state, **table, **flags, "rewards": rewards, **changes}
     return Rollout(**{key: column[:, np.newaxis] for key, column in columns.items()})
 
 

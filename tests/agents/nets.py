@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from rotorgram.agents.config import Config, SACConfig
 from rotorgram.agents.layers import Weights, named
-from rotorgram.agents.networks import MLP, Network
+from rotorgram.agents.networks import Network
 from rotorgram.agents.policies import NetworkPolicy
 from rotorgram.envs.spec import ArraySpec, EnvSpec
 
@@ -44,11 +44,11 @@ def arrays_of(agent: Any) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]
 
 def mlp_of(
     sizes: tuple[int, ...], activation: str = "relu", values: np.ndarray | float = 0.0
-) -> tuple[MLP, Weights]:
+) -> tuple[Network, Weights]:
     """An MLP of so many inputs, units and outputs."""
     inputs, *hidden, outputs = sizes
     seen = [ArraySpec(name="seen", shape=(inputs,))]
-    network = MLP(seen, outputs, config_of(tuple(hidden), activation))
+    network = Network(seen, outputs, config_of(tuple(hidden), activation))
     return network, bound(network, values)
 
 

@@ -54,7 +54,15 @@ def rollout(rng: np.random.Generator, *, discrete: bool) -> Rollout:
         actions = rng.integers(3, size=(*lead, 1)).astype(np.float32)
     ends = rng.random((2, *lead)) < 0.1
     rewards = rng.normal(size=lead)
-    return Rollout(seen[:-1], actions, rewards, seen[1:], *ends, kept=np.ones(lead, bool))
+    return Rollout(
+        np.zeros((0, lead[1]), np.float32),
+        seen[:-1],
+        actions,
+        rewards,
+        seen[1:],
+        *ends,
+        kept=np.ones(lead, bool),
+    )
 
 
 class Reference:

@@ -27,7 +27,7 @@ from rotorgram.agents import (
 from rotorgram.agents.checkpoints import CheckpointError
 from rotorgram.agents.learner import Learner
 from rotorgram.models.errors import InputError
-from rotorgram.models.files import software_versions, write_whole
+from rotorgram.models.files import other_versions, software_versions, write_whole
 
 SMALL: dict[str, dict[str, Any]] = {
     "vpg": {"episodes_per_update": 3},
@@ -87,7 +87,7 @@ def test_a_training_that_was_stopped_ends_as_if_it_had_not(
     kept = load(tmp_path / "c")
     assert kept.num_envs == drones
     assert kept.env_id == ENV
-    assert kept.options["episode_length"] == 30
+    assert kept.spec.options["episode_length"] == 30
     assert kept.position.episodes == stopped.position.episodes
     torch.manual_seed(99)  # nothing may depend on what the process did before
     log = log_of(drones, action_type=kind)
@@ -118,9 +118,9 @@ def test_a_checkpoint_tells_where_it_comes_from(kept: Checkpoint) -> None:
     assert kept.seed == 5
     assert kept.spec.vehicle_hash != "0" * 32
     assert kept.versions == software_versions()
-    assert kept.other_versions() == {}
+    assert other_versions(kept.versions) == {}
     other = replace(kept, versions={**kept.versions, "torch": "0.1"})
-    assert other.other_versions() == {"torch": ("0.1", kept.versions["torch"])}
+    assert other_versions(other.versions) == {"torch": ("0.1", kept.versions["torch"])}
     policy = kept.policy()
     action = policy.act(np.zeros(3, np.float32))
     assert action.shape == (1,)

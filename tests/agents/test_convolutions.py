@@ -7,7 +7,7 @@ from contracts import spec_with
 from nets import bound
 from rotorgram.agents import Config
 from rotorgram.agents.layers import Weights
-from rotorgram.agents.networks import CNN, MLP, Network
+from rotorgram.agents.networks import CNN, Network
 from rotorgram.envs import LocalVectorEnv
 from rotorgram.envs.spec import IMAGE, PICTURE, RINGS, ArraySpec, SpecError
 from rotorgram.models import InputError
@@ -156,7 +156,7 @@ def test_a_ring_that_turns_turns_what_is_seen() -> None:
 
 
 def test_an_mlp_takes_images_flat_and_a_cnn_of_plain_arrays_is_refused() -> None:
-    mlp, _ = network_of(MLP)
+    mlp, _ = network_of(Network)
     assert mlp.shapes["layers.0.weight"] == (7, 91)
     with pytest.raises(InputError, match="network: expected rays in rows or rings, or pictures,"):
         CNN([PLAIN, AFTER], 2, SMALL)

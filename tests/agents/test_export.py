@@ -404,7 +404,7 @@ def test_every_file_tells_what_it_is(trained: Path, tmp_path: Path) -> None:
         "env_steps": str(kept.position.env_steps),
     }
     assert plain.items() <= told.items()
-    assert json.loads(told["options"]) == kept.options
+    assert json.loads(told["options"]) == kept.spec.options
     (observation,) = json.loads(told["observation"])
     names = ["elevation error", "rate of the error", "thrust over hover"]
     assert observation["components"] == names

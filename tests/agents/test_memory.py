@@ -13,7 +13,7 @@ from rotorgram.agents import Config, EpisodeRecorder, PPOConfig, VPGConfig, make
 from rotorgram.agents.a2c import A2C, A2CConfig
 from rotorgram.agents.layers import Weights
 from rotorgram.agents.memory import GRU, Sequences
-from rotorgram.agents.networks import MLP
+from rotorgram.agents.networks import Network
 from rotorgram.agents.policies import NetworkPolicy
 from rotorgram.agents.ppo import PPO
 from rotorgram.agents.rollouts import Collector
@@ -34,8 +34,8 @@ def dice(seed: int = 0) -> np.random.Generator:
     return np.random.default_rng(seed)
 
 
-def network_of(config: Config = SMALL) -> tuple[MLP, Weights]:
-    network = MLP([SEEN], 2, config)
+def network_of(config: Config = SMALL) -> tuple[Network, Weights]:
+    network = Network([SEEN], 2, config)
     weights = bound(network)
     weights.values[:] = dice(1).normal(size=weights.values.size)
     return network, weights

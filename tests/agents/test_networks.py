@@ -5,13 +5,14 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from drones import log_of
 from nets import bound, config_of, mlp_of, random_policy
 from rotorgram.agents.config import Config
 from rotorgram.agents.layers import Affine, Layer, Relu, Tanh, Weights, orthogonal
-from rotorgram.agents.networks import MLP, Network
+from rotorgram.agents.networks import Network
 from rotorgram.agents.optimizers import Adam, clip_norm
 from rotorgram.agents.policies import NetworkPolicy
-from rotorgram.agents.vpg import VPGConfig
+from rotorgram.agents.vpg import VPG, VPGConfig
 from rotorgram.envs.spec import ArraySpec, Discrete
 from scripted import spec_of
 
@@ -109,7 +110,7 @@ def test_adam_is_torch_s() -> None:
     weights.values[:] = normal(40)
     theirs = torch.tensor(weights.values.copy(), requires_grad=True)
     reference = torch.optim.Adam([theirs], lr=0.01)
-    ours = Adam(weights)
+    ours = Adam(weights, 1e-8)
     for step in range(50):
         scale = 10.0 ** (step % 5 - 3)
         weights.slopes[:] = scale * normal(40)
@@ -121,9 +122,9 @@ def test_adam_is_torch_s() -> None:
 
 def test_a_norm_is_clipped_as_in_torch() -> None:
     slopes = np.array([3, 4], np.float32)
-    assert clip_norm(slopes, 6.0) == 5.0
+    clip_norm(slopes, 6.0)
     assert slopes.tolist() == [3, 4]
-    assert clip_norm(slopes, 0.5) == 5.0
+    clip_norm(slopes, 0.5)
     np.testing.assert_allclose(slopes, [0.3, 0.4], rtol=1e-6)
 
 
@@ -138,15 +139,14 @@ def test_the_first_weights_are_orthogonal(shape: tuple[int, int]) -> None:
 
 
 def test_an_actor_begins_near_zero_and_a_net_with_gains() -> None:
-    ours = actor(discrete=False)
-    ours.initialise(np.random.default_rng(0), -0.5)
+    ours = VPG(log_of(), VPGConfig(log_std=-0.5), 0).policy()
     arrays = ours.weights.arrays
     first = arrays["layers.0.weight"]
     columns = np.linalg.norm(first[:, 1:], axis=0)
     rows = np.linalg.norm(arrays["layers.1.weight"], axis=1)
     np.testing.assert_allclose(columns, 2**0.5, rtol=1e-5)
     np.testing.assert_allclose(rows, 0.01, rtol=1e-5)
-    assert arrays["log_std"].tolist() == [-0.5] * 3
+    assert arrays["log_std"].tolist() == [-0.5]
     assert not first[:, 0].any()
 
 
@@ -172,7 +172,7 @@ def test_bytes_of_pictures_come_in_as_0_to_1() -> None:
     """Others stay, as whole numbers of another range; the first sees 2 x, the second 1 + 5 x."""
     pixels = ArraySpec(name="front", shape=(1, 1, 3), dtype="uint8", low=0.0, high=255.0)
     count = ArraySpec(name="gates", shape=(1,), dtype="uint8", low=0.0, high=9.0)
-    network = MLP([count, pixels], 2, config_of((), "tanh"))
+    network = Network([count, pixels], 2, config_of((), "tanh"))
     weights = bound(network)
     weights.arrays["layers.0.weight"][:] = [[0, 2, 0, 0, 2], [1, 0, 5, 0, 0]]
     inputs = np.array([[3.0], [51.0], [7.0], [255.0]], np.float32)
@@ -186,7 +186,7 @@ def test_distances_come_in_as_nearness() -> None:
     near = [ArraySpec(name=f"near {s}", shape=s, low=0.0, unit="m") for s in shapes]
     plain = [ArraySpec(name=f"plain {n}", shape=(n,)) for n in (1, 2)]
     arrays = [plain[0], near[0], plain[1], near[1]]
-    network = MLP(arrays, 2, config_of((4,), "tanh"))
+    network = Network(arrays, 2, config_of((4,), "tanh"))
     weights = bound(network)
     weights.values[:] = normal(weights.values.size)
     inputs = np.abs(normal(6, BATCH)) * 3.0

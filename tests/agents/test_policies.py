@@ -63,7 +63,7 @@ def drawn_of(policy: NetworkPolicy, observation: np.ndarray) -> np.ndarray:
     """Many actions for the same observation."""
     noise = policy.head.noise(np.random.default_rng(0), DRAWS)
     observations = np.repeat(observation, DRAWS, axis=0)
-    return policy.sample(observations, noise)
+    return policy.head.sample(policy.outputs(observations), noise)
 
 
 def test_gaussian_sampling_has_the_mean_and_deviation_of_the_policy() -> None:

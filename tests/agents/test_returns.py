@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from rotorgram.agents.rollouts import advantages, discounted_sums, rewards_to_go, step_of_episode
+from rotorgram.agents.rollouts import advantages, discounted_sums, step_of_episode
 
 CASES: dict[str, Any] = json.loads(
     (Path(__file__).parents[1] / "data" / "returns.json").read_text(encoding="utf-8")
@@ -18,7 +18,7 @@ def test_rewards_to_go_by_hand(name: str) -> None:
     case = CASES["returns"][name]
     ends = np.array(case["ends"], bool)
     rewards = np.array(case["rewards"], float)
-    returns = rewards_to_go(rewards, ends, gamma=case["gamma"])
+    returns = discounted_sums(rewards, case["gamma"] * ~ends)
     assert returns.tolist() == case["expected"]
 
 

@@ -183,7 +183,7 @@ def test_a_task_of_the_working_directory(tmp_path: Path) -> None:
     assert done.returncode == 0, done.stderr
     kept = load(tmp_path / "run" / "checkpoint.safetensors")
     assert kept.env_id == "Low-v0"
-    assert kept.options["target"] == 4.0
+    assert kept.spec.options["target"] == 4.0
     done = shell(f"rotorgram evaluate {tmp_path}/run --episodes 1")
     assert done.returncode == 1
     assert done.stderr.count("\n") == 1
@@ -488,7 +488,7 @@ def test_train_evaluate_and_resume(tmp_path: Path, capsys: Capsys) -> None:
     kept = load(folder / "checkpoint.safetensors")
     assert kept.algorithm == "a2c"
     assert kept.config["steps_per_update"] == 100
-    assert kept.options["episode_length"] == 60
+    assert kept.spec.options["episode_length"] == 60
     assert len(kept.spec.vehicle_hash) == 32
     assert json.loads((folder / "config.json").read_text())["seed"] == 0
     assert len(pd.read_csv(folder / "episodes.csv")) >= 20
@@ -506,10 +506,10 @@ def test_train_evaluate_and_resume(tmp_path: Path, capsys: Capsys) -> None:
     )
     reference = fitted(parse(Serve, "serve", ["x"]), kept)
     assert reference.env_id == "rotorgram/Elevation-v0"
-    assert reference.options == kept.options
+    assert reference.options == kept.spec.options
     words = ["x", "--episode-length", "1000", "--effects", "linear_drag=0"]  # the defaults
     assert fitted(parse(Serve, "serve", words), kept).options == {
-        **kept.options, "episode_length": 1000, "effects": {"linear_drag": 0}
+        **kept.spec.options, "episode_length": 1000, "effects": {"linear_drag": 0}
     }  # fmt: skip
     (folder / "episodes.csv").unlink()  # a result: the checkpoint has the episodes
     output(capsys, "train", "a2c", "--resume", folder)

@@ -38,7 +38,8 @@ def test_two_of_the_same_second_get_two_folders(
             return cls(2026, 1, 2, 3, 4, 5)
 
     monkeypatch.setattr(folders, "datetime", Still)
-    made = [new_folder(None, "train-a2c", tmp_path / "runs") for _ in range(3)]
+    monkeypatch.chdir(tmp_path)
+    made = [new_folder(None, "train-a2c") for _ in range(3)]
     names = ["train-a2c-20260102-030405", "train-a2c-20260102-030405-2"]
     assert [folder.name for folder in made[:2]] == names
     assert len(set(made)) == 3

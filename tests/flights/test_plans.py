@@ -10,7 +10,7 @@ from matplotlib.contour import QuadContourSet
 from rotorgram.cli import main
 from rotorgram.envs.config import EnvConfig
 from rotorgram.envs.registry import env_spec
-from rotorgram.flights.plans import drawn_plan
+from rotorgram.flights.plots import drawn_plan
 from rotorgram.flights.trajectories import Trajectory, flown_trajectories
 from rotorgram.models import InputError
 from rotorgram.scenes import Solids

@@ -279,7 +279,7 @@ def comparison(training: Path, tmp_path: Path) -> Results:
     for row in rows:
         tables = {}
         for name in ("evaluations", "runs"):
-            tables[name] = pd.DataFrame(0.0, index=[0], columns=list(COLUMNS[name][2:]))
+            tables[name] = pd.DataFrame(0.0, index=[0], columns=list(COLUMNS[name])[2:])
         tables["evaluations"]["episode"] = 0
         write_run(folder, row, 0, tables)
     return Results.read(folder)

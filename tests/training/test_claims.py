@@ -12,7 +12,6 @@ from rotorgram.training.claims import (
     convergence_step,
     fluctuation,
     judge_claims,
-    judge_no_worse,
     long_run_return,
 )
 from rotorgram.training.metrics import Headline
@@ -58,7 +57,14 @@ HELD = evaluated(a2c=[0.01] * 80, vpg=[0.02] * 80)
 
 
 def judged(episodes: pd.DataFrame, evaluations: pd.DataFrame = HELD) -> list[Verdict]:
-    return judge_claims(episodes, evaluations, HEADLINE)
+    """The verdicts on the paper's claims."""
+    return judge_claims(episodes, evaluations, HEADLINE)[:4]
+
+
+def no_worse(evaluations: pd.DataFrame, headline: Headline) -> Verdict:
+    """The verdict on the claim about SB3's A2C."""
+    *_, verdict = judge_claims(run(np.zeros(0)), evaluations, headline)
+    return verdict
 
 
 def outcomes(episodes: pd.DataFrame, evaluations: pd.DataFrame = HELD) -> list[str]:
@@ -251,7 +257,7 @@ def test_runs_that_are_too_short_are_named():
 
 
 def test_verdicts_state_their_source():
-    for verdict in judge_claims(training(paper_like), HELD, HEADLINE):
+    for verdict in judged(training(paper_like)):
         assert "ection 3" in verdict.source
         assert verdict.definition
 
@@ -269,7 +275,7 @@ def test_verdicts_state_their_source():
 )
 def test_no_worse_is_shown_by_a_margin(ours, theirs, expected):
     evaluations = evaluated(a2c=ours, **{"sb3-a2c": theirs})
-    verdict = judge_no_worse(evaluations, HEADLINE)
+    verdict = no_worse(evaluations, HEADLINE)
     assert verdict.verdict == expected
     assert "margin of 0.02 m" in verdict.definition
 
@@ -278,10 +284,10 @@ def test_no_worse_of_what_is_to_be_high_and_of_what_was_not_trained():
     high = Headline.of(spec_of(GATES))  # held from 3 gates on: the margin is 0.6 of a gate
     theirs = {"sb3-a2c": [5.0] * 30}
     alike = evaluated(a2c=[4.5] * 30, **theirs)
-    assert judge_no_worse(alike, high).verdict == "borne out"
+    assert no_worse(alike, high).verdict == "borne out"
     worse = evaluated(a2c=[4.0] * 30, **theirs)
-    assert judge_no_worse(worse, high).verdict == "not borne out"
+    assert no_worse(worse, high).verdict == "not borne out"
     alone = evaluated(a2c=[4.5] * 30)
-    verdict = judge_no_worse(alone, high)
+    verdict = no_worse(alone, high)
     assert verdict.verdict == "not tested"
     assert verdict.evidence == "sb3-a2c was not trained."

@@ -86,8 +86,8 @@ def test_a_headline_says_how_its_numbers_are_read():
     assert gates.held_text == "gates_passed ≥ 3"
     assert HEADLINE.labelled("Steady |E|") == "Steady |E| (m)"
     assert gates.labelled("Steady") == "Steady"
-    assert HEADLINE.size([-1.0]) == 1.0
-    assert gates.size([-1.0]) == -1.0
+    assert HEADLINE.size(np.array([-1.0])) == 1.0
+    assert gates.size(np.array([-1.0])) == -1.0
 
 
 def test_the_bound_of_a_goal():
@@ -99,13 +99,13 @@ def test_the_bound_of_a_goal():
 
 @pytest.mark.parametrize(("errors", "expected"), BY_HAND["settling"])
 def test_settling_time(errors: list[float], expected: float) -> None:
-    value = settling_time(errors, control_period=0.1, tolerance=0.05)
+    value = settling_time(np.array(errors), control_period=0.1, tolerance=0.05)
     assert value == pytest.approx(expected, nan_ok=True)
 
 
 @pytest.mark.parametrize(("errors", "expected"), BY_HAND["overshoot"])
 def test_overshoot(errors: list[float], expected: float) -> None:
-    assert overshoot(errors) == pytest.approx(expected, nan_ok=True)
+    assert overshoot(np.array(errors)) == pytest.approx(expected, nan_ok=True)
 
 
 def test_reaching_the_target_counts_from_the_first_snapshot_that_lasts():

@@ -23,7 +23,7 @@ from rotorgram.flights.folders import locked
 from rotorgram.flights.trajectories import fly_episodes
 from rotorgram.models.errors import InputError
 from rotorgram.training.metrics import measure_episode
-from rotorgram.training.results import Results, ResultsError, checkpoint_file
+from rotorgram.training.results import Results, checkpoint_file
 from rotorgram.training.settings import BOARD, Row, Study
 from rotorgram.training.study import open_env, run_study
 
@@ -387,10 +387,10 @@ def test_wrong_files_are_one_sentence(text: str, sentence: str, tmp_path: Path) 
 
 
 def test_results_that_are_wrong_are_one_sentence(tmp_path: Path) -> None:
-    with pytest.raises(ResultsError, match=r"expected the folder of a study, .*config\.json$"):
+    with pytest.raises(InputError, match=r"expected the folder of a study, .*config\.json$"):
         Results.read(tmp_path)
     (tmp_path / "config.json").write_text("{}")
-    with pytest.raises(ResultsError, match="expected the settings of a study"):
+    with pytest.raises(InputError, match="expected the settings of a study"):
         Results.read(tmp_path)
 
 
@@ -399,10 +399,10 @@ def test_a_table_that_is_no_table_is_one_sentence(tmp_path: Path) -> None:
     for name in ("runs", "evaluations"):
         (file,) = (folder / name).iterdir()
         file.write_text("nothing")
-        with pytest.raises(ResultsError, match=f"{name}: expected Parquet files"):
+        with pytest.raises(InputError, match=f"{name}: expected Parquet files"):
             getattr(Results.read(folder), name)
         pd.DataFrame({"row": ["a2c"]}).to_parquet(file)
-        with pytest.raises(ResultsError, match=rf"{name}: expected the columns .*, got no seed, "):
+        with pytest.raises(InputError, match=rf"{name}: expected the columns .*, got no seed, "):
             getattr(Results.read(folder), name)
 
 
