@@ -102,17 +102,16 @@ class Pictures(Instrument):
         seen = {name: getattr(moment, name) for name in _SEEN}
         state = {name: x.reshape(count, -1) for name, x in seen.items() if x is not None}
         state["time"] = self._period * moment.steps.ravel()
-        taken = {name: drones.ravel() for name, drones in due.items()}
         pictures = {
             view.name: np.zeros((*self._shape, *view.shape), view.dtype) for view in self.views
         }
 
         def paint(painter: _Painter) -> None:
             worlds = painter.worlds & (scenes == painter.scene)
-            painter.cameras.take(taken, state, worlds)
-            drones = np.repeat(worlds, self._shape[1])
+            mine = {name: (mask & worlds[:, None]).ravel() for name, mask in due.items()}
+            painter.cameras.take(mine, state)
             for view in self.views:
-                rows = taken[view.name] & drones
+                rows = mine[view.name]
                 picture = painter.cameras.pictures[view.name][rows]
                 if view.kind == "segmentation":
                     numbers = [self._names.index(name) for name in painter.cameras.objects]

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 Array = np.ndarray
+Triple = tuple[Array, Array, Array]
 _NOTHING = 1e-13  # of a number: what rounding leaves
 
 
@@ -27,9 +28,23 @@ def dot(a: Sequence[Array], b: Sequence[Array]) -> Array:
     return total
 
 
-def cross(a: Sequence[Array], b: Sequence[Array]) -> tuple[Array, Array, Array]:
+def cross(a: Sequence[Array], b: Sequence[Array]) -> Triple:
     """As `dot`."""
     return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
+
+
+def rotation(
+    quaternion: Sequence[Array], twice: float | Array = 2.0
+) -> tuple[Triple, Triple, Triple]:
+    """Matrix from the frame of a unit quaternion, scalar first, to that about it; `twice` is 2 over
+    the squared length of another quaternion.
+    """
+    w, x, y, z = quaternion
+    return (
+        (1.0 - twice * (y * y + z * z), twice * (x * y - w * z), twice * (x * z + w * y)),
+        (twice * (x * y + w * z), 1.0 - twice * (x * x + z * z), twice * (y * z - w * x)),
+        (twice * (x * z - w * y), twice * (y * z + w * x), 1.0 - twice * (x * x + y * y)),
+    )
 
 
 def product(a: Array, b: Array) -> Array:

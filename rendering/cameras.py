@@ -18,11 +18,11 @@ from ..models.fleet import members_of
 from ..models.mjcf import swarm_spec
 from ..models.swarm import drone_names
 from ..models.vehicle import Vehicle, owners
-from ..scenes import SceneConfig, add_scene
+from ..scenes import SceneConfig
+from ..scenes.build import add_scene, move_geoms
 from ..scenes.looks import PICTURED
 from ..scenes.marks import Mark
 from .gl import Offscreen
-from .moving import MovingGeoms
 from .stage import LOOKS, scale_drawing
 
 Array = np.ndarray
@@ -71,7 +71,7 @@ class Cameras:
         names = drone_names(shape[1])
         self.model = drawn_model(vehicle, shape[1], scene, marks, payload=payload)
         self.data = mujoco.MjData(self.model)
-        self._moving = MovingGeoms(self.model, scene)
+        self._scene = scene
         self.objects, self._object = objects_in(self.model)
         rows = shape[0] * shape[1]
         self.pictures = {
@@ -79,8 +79,6 @@ class Cameras:
         }
         self._cameras = {view.name: self._camera_ids(view, names) for view in self.views}
         self._geoms: dict[int, Array] = {}
-        free = self.model.jnt_type == mujoco.mjtJoint.mjJNT_FREE
-        self._poses = self.model.jnt_qposadr[free][:, None] + np.arange(7)
         self._moved = {
             GOAL: self._mocap_ids([f"{name}/{GOAL}" for name in names]),
             PAYLOAD: self._mocap_ids([PAYLOAD]),
@@ -114,19 +112,16 @@ class Cameras:
         with self._drawing.current():
             pass
 
-    def take(self, due: Arrays, state: Arrays, of: Array | None = None) -> None:
+    def take(self, due: Arrays, state: Arrays) -> None:
         """Take pictures of the worlds as they are.
 
         `due` has, by view name, the drones that take a picture, bool, shape (N,).
 
         The state has `position` (N, 3) and `quaternion` (N, 4), and, where there are any, `goal`
-        and `payload` (N, 3): MuJoCo's world frame, m, and `time` of their episodes, (N,), s. `of`
-        has the worlds that are drawn, bool, shape (W,); None: all.
+        and `payload` (N, 3): MuJoCo's world frame, m, and `time` of their episodes, (N,), s.
         """
         of_world = {name: np.reshape(mask, self._shape) for name, mask in due.items()}
         needed = np.any(list(of_world.values()), axis=(0, 2))
-        if of is not None:
-            needed &= of
         with self._drawing.current():
             for world in np.flatnonzero(needed).tolist():
                 rows = self._pose(state, world)
@@ -138,9 +133,10 @@ class Cameras:
         drones = self._shape[1]
         rows = slice(world * drones, (world + 1) * drones)
         if "time" in state:
-            self._moving.show(float(state["time"][rows.start]))
-        self.data.qpos[self._poses[:, :3]] = state["position"][rows]
-        self.data.qpos[self._poses[:, 3:]] = state["quaternion"][rows]
+            move_geoms(self.model, self._scene, float(state["time"][rows.start]))
+        poses = self.data.qpos.reshape(drones, 7)
+        poses[:, :3] = state["position"][rows]
+        poses[:, 3:] = state["quaternion"][rows]
         for name, bodies in self._moved.items():
             if bodies and name in state:
                 self.data.mocap_pos[bodies] = state[name][rows][: len(bodies)]

@@ -23,11 +23,10 @@ from ..models.mjcf import level_data, swarm_spec
 from ..models.swarm import drone_names
 from ..models.vehicle import owners
 from ..scenes import SceneConfig
-from ..scenes.build import SCENE_PREFIX, add_scene
+from ..scenes.build import SCENE_PREFIX, add_scene, move_geoms
 from ..scenes.marks import Mark, Point
 from ..scenes.returns import Reading
 from .gl import Lines, Offscreen
-from .moving import MovingGeoms
 
 Array = np.ndarray
 
@@ -162,7 +161,7 @@ class Stage:
             raise InputError(
                 f"vehicle: expected a file that can be drawn, got: {one_line(error)}"
             ) from None
-        self._moving = MovingGeoms(self.model, scene)
+        self._scene = scene
         self.radius = _drawn_radius(self.model)
         self.model.camera(_ONBOARD).pos = np.multiply(_SEAT, self.radius)
         spread = _SPREAD * math.isqrt(drones - 1) * self.radius
@@ -202,7 +201,7 @@ class Stage:
                 if self._reach:
                     reach = min(reach, _FAR * self.radius)
                 self._reach = max(self._reach, reach)
-        self._moving.show(moments[0].time)
+        move_geoms(self.model, self._scene, moments[0].time)
         place_cameras(self.model, self.data)
 
     def camera(self, name: Camera | Literal["free"]) -> mujoco.MjvCamera:

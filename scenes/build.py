@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from mujoco import MjSpec
+from mujoco import MjModel, MjSpec
 
 from ..models import QUAD_XML
 from ..models.mjcf import delete_obstacles, has_ground, read_spec
@@ -57,6 +57,17 @@ def add_scene(spec: MjSpec, scene: str | SceneConfig = "plain") -> None:
             light.active = False
         add_parts(spec, chosen)
     spec.compiler.discardvisual = False
+
+
+def move_geoms(model: MjModel, scene: str | SceneConfig, time: float) -> None:
+    """Put the geoms of a scene in a model where its solids are at a time of an episode, s."""
+    chosen = parse_scene(scene)
+    if not chosen.type.moves:
+        return
+    solids = Solids.of_scene(chosen)
+    moving = solids[solids.moves].at(time)
+    geoms = [model.geom(name).id for name in moving.names]
+    model.geom_pos[geoms] = moving.centers
 
 
 def _add_obstacles(spec: MjSpec, content: str) -> None:

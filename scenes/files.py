@@ -16,10 +16,8 @@ from ..models.files import read_toml
 from ..models.mjcf import MAX_BYTES, check_sizes, switch_off_log_file
 from .config import SceneConfig
 from .fields import check_points
-from .geoms import geoms_of
-from .kernels import KINDS
-from .obstacles import HULL, SIZES, Obstacle, obstacles_in, to_content
-from .solids import Solids
+from .obstacles import HULL, Obstacle, obstacles_in, to_content
+from .solids import obstacle_of
 
 _GREY = (0.5, 0.5, 0.5, 1.0)  # of a geom without a colour of its own
 
@@ -73,29 +71,14 @@ def _of_mjcf(path: Path) -> Iterator[Obstacle]:
         name = model.geom(int(moves.argmax())).name or "one without a name"
         raise InputError(f"expected geoms that stand still, got {name}, which moves")
     is_mesh = model.geom_type == mjtGeom.mjGEOM_MESH
-    primitives = _primitives(Solids.of_model(model, ~is_mesh))
     data = MjData(model)
     mujoco.mj_kinematics(model, data)
     for geom in sorted(spec.geoms, key=lambda one: one.id):
         i = geom.id
-        one = _hull(model, data, i) if is_mesh[i] else next(primitives)
+        one = _hull(model, data, i) if is_mesh[i] else obstacle_of(model, data, i)
         color = tuple(model.geom_rgba[i, :3].astype(float).round(4).tolist())
         label = geom.classname.name
         yield replace(one, color=color, label="" if label == "main" else label)
-
-
-def _primitives(solids: Solids) -> Iterator[Obstacle]:
-    rows = geoms_of(solids, len(solids))
-    return (
-        Obstacle(
-            kind=KINDS[kind],
-            size=tuple(rows["geom_size"][i, : SIZES[KINDS[kind]]].tolist()),
-            position=tuple(solids.centers[i].tolist()),
-            heights=() if solids.grids[i] is None else solids.grids[i].round(5),
-            quaternion=tuple(rows["geom_quat"][i].tolist()),
-        )
-        for i, kind in enumerate(solids.kinds.tolist())
-    )
 
 
 def _hull(model: MjModel, data: MjData, geom: int) -> Obstacle:

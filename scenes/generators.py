@@ -73,8 +73,7 @@ class Draft:
         self.scene = scene
         self.options = scene.values
         self.openings: list[tuple[float, ...]] = []
-        """In the order in which they are passed: center, x and y of the direction, half the width,
-        m."""
+        """As the rows of `ways`."""
         self.rng = np.random.Generator(np.random.PCG64(seed))
         self.blocks: list[Block] = []
 
@@ -85,7 +84,10 @@ class Draft:
 
     @property
     def ways(self) -> Array:
-        """The openings, shape (K, 6)."""
+        """Gates in the order in which they are passed, or ways through rows of racks, shape (K, 6).
+
+        The center, m; x and y of the direction in which it is passed; half the width, m.
+        """
         return np.array(self.openings).reshape(-1, 6)
 
     def uniform(self, low: float, high: float) -> float:
@@ -379,14 +381,6 @@ def _add_gate(track: Draft, number: int) -> None:
     for part, sign in (("top", 1), ("bottom", -1)):
         position = (x, y, height + sign * (half + bar))
         track.add(f"gate_{number}/frame_{part}", "box", (0.15, half, bar), position, tint, heading)
-
-
-def openings_of(scene: SceneConfig, seed: int) -> Array:
-    """Gates of a scene in their order, or ways through its rows of racks, shape (K, 6).
-
-    The center, m; x and y of the direction in which it is passed; half the width, m.
-    """
-    return drafted(scene, seed).ways
 
 
 @lru_cache(maxsize=4)

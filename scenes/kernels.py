@@ -57,24 +57,13 @@ Numba = Any
 """What Numba gives and takes, which has no types."""
 Options = dict[str, Any]
 
+# What formulas are made of: here for arrays; `Maker` has the first three for numbers.
+_least: Function = np.minimum
+_most: Function = np.maximum
+_pick: Function = np.where
 _root = np.sqrt
 _down = np.floor
 _index = np.int64
-
-
-# ---- what formulas are made of: here for arrays, in `compiled` for numbers
-
-
-def _least(a: Array, b: Array) -> Array:
-    return np.minimum(a, b)
-
-
-def _most(a: Array, b: Array) -> Array:
-    return np.maximum(a, b)
-
-
-def _pick(flag: Array, yes: Array, no: Array) -> Array:
-    return np.where(flag, yes, no)
 
 
 def _nonzero(x: Array) -> Array:
@@ -271,26 +260,24 @@ def _three(table: Array, first: int, j: Array) -> Vector:
     return table[first, j], table[first + 1, j], table[first + 2, j]
 
 
+def _minus(a: Vector, b: Vector) -> Vector:
+    return a[0] - b[0], a[1] - b[1], a[2] - b[2]
+
+
 def _along(vector: Vector, u: Vector, v: Vector, axis: Vector) -> Vector:
     return dot(vector, u), dot(vector, v), dot(vector, axis)
 
 
 def _turned(m: Array, vector: Vector) -> Vector:
     """A vector of the world in the frame of a sensor, by the columns of its attitude."""
-    x, y, z = vector
-    return (
-        m[0] * x + m[3] * y + m[6] * z,
-        m[1] * x + m[4] * y + m[7] * z,
-        m[2] * x + m[5] * y + m[8] * z,
-    )
+    return _along(vector, (m[0], m[3], m[6]), (m[1], m[4], m[7]), (m[2], m[5], m[8]))
 
 
 def _seen(table: Array, j: Array, place: Array, attitude: Array) -> Array:
     """Center, three axes and size of a primitive in the frame of a sensor, and between them its
     center along the axes. Its size is half its sides, and half of the third without its rounding.
     """
-    x, y, z = _three(table, _CENTER, j)
-    center = _turned(attitude, (x - place[0], y - place[1], z - place[2]))
+    center = _turned(attitude, _minus(_three(table, _CENTER, j), place))
     u = _turned(attitude, _three(table, _U, j))
     v = _turned(attitude, _three(table, _V, j))
     axis = _turned(attitude, _three(table, _AXIS, j))
@@ -301,8 +288,7 @@ def _seen(table: Array, j: Array, place: Array, attitude: Array) -> Array:
 
 def _local(table: Array, j: Array, point: Vector) -> Vector:
     """A point from the center of a primitive, along its axes."""
-    x, y, z = _three(table, _CENTER, j)
-    away = (point[0] - x, point[1] - y, point[2] - z)
+    away = _minus(point, _three(table, _CENTER, j))
     return _along(away, _three(table, _U, j), _three(table, _V, j), _three(table, _AXIS, j))
 
 
@@ -350,31 +336,27 @@ def _gap_of_hfield(table: Array, j: Array, point: Vector) -> Array:
     column, row = _least(_down(x), last), _least(_down(y), final)
     x, y = x - column, y - row
     aside = _least((_ONE + _least(x, _ONE - x)) * wide, (_ONE + _least(y, _ONE - y)) * deep)
+    field = (table, j, wide, deep, place)
     square = _BIG
     for m in _AROUND:
         for n in _AROUND:
             p = _most(_least(row + m, final), _ZERO)
             q = _most(_least(column + n, last), _ZERO)
-            low = _corner(table, j, p, q, wide, deep, place)
-            high = _corner(table, j, p + _ONE, q + _ONE, wide, deep, place)
-            right = _corner(table, j, p, q + _ONE, wide, deep, place)
-            left = _corner(table, j, p + _ONE, q, wide, deep, place)
+            low = _corner(field, p, q)
+            high = _corner(field, p + _ONE, q + _ONE)
+            right = _corner(field, p, q + _ONE)
+            left = _corner(field, p + _ONE, q)
             square = _least(square, _least(_triangle(low, right, high), _triangle(low, high, left)))
     beyond = _most(aside, abs(over) * _number(table, j, _TWO))
     near = _least(_root(square), beyond)
     return _most(_gap(BOX, table, j, point, _ZERO), _pick(over < _ZERO, -near, near))
 
 
-def _corner(
-    table: Array, j: Array, row: Array, column: Array, wide: Array, deep: Array, place: Vector
-) -> Vector:
-    """Of a grid with cells of a width and a depth, from a place."""
+def _corner(field: Array, row: Array, column: Array) -> Vector:
+    """Of the grid of a height field, from a place, with cells of a width and a depth."""
+    table, j, wide, deep, place = field
     height = _number(table, j, _HEADER + row * _number(table, j, _ZERO) + column)
     return _minus((column * wide, row * deep, height), place)
-
-
-def _minus(a: Vector, b: Vector) -> Vector:
-    return a[0] - b[0], a[1] - b[1], a[2] - b[2]
 
 
 def _triangle(p: Vector, q: Vector, r: Vector) -> Array:
@@ -578,7 +560,7 @@ def _packets(
 def _ranges(table: Array, place: Array, reach: Array, far: Array) -> None:
     """Set `far` to how far primitives lie beyond the reach of rays from a place, m."""
     for j in range(far.size):
-        far[j] = _gap(BOX, table, j, (place[0], place[1], place[2]), _ZERO) - reach
+        far[j] = _gap(BOX, table, j, place, _ZERO) - reach
 
 
 def _hide(table: Array, place: Array, m: Array, planes: Array, bounds: Array, far: Array) -> None:
@@ -587,11 +569,9 @@ def _hide(table: Array, place: Array, m: Array, planes: Array, bounds: Array, fa
     """
     x_row, y_row, z_row = m[:3], m[3:6], m[6:]
     for f in range(6):
-        x, y, z = _along(planes[f], x_row, y_row, z_row)
-        bounds[f, 0], bounds[f, 1], bounds[f, 2] = x, y, z
+        bounds[f, 0], bounds[f, 1], bounds[f, 2] = _along(planes[f], x_row, y_row, z_row)
     for j in range(far.size):
-        x, y, z = _three(table, _CENTER, j)
-        center = (x - place[0], y - place[1], z - place[2])
+        center = _minus(_three(table, _CENTER, j), place)
         u, v, axis = _three(table, _U, j), _three(table, _V, j), _three(table, _AXIS, j)
         solid = (center, u, v, axis, center, _three(table, _SIZE, j))
         worst = _BIG

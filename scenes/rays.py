@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..models.errors import InputError, shortened
 from ..models.fields import Limits, check
-from ..models.matrices import settled
+from ..models.matrices import rotation, settled
 from . import kernels
 from .kernels import LANES
 from .solids import Layouts, numbers
@@ -186,13 +186,8 @@ def _matrices(quaternions: np.ndarray) -> Array:
     """Rows of rotation matrices, (W, 9)."""
     scaled = quaternions / abs(quaternions).max(axis=-1, keepdims=True)
     unit = scaled / np.sqrt((scaled * scaled).sum(axis=-1, keepdims=True))
-    w, x, y, z = unit.T
-    rows = (
-        1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
-        2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
-        2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
-    )  # fmt: skip
-    return np.column_stack(rows).astype(np.float32)
+    first, second, third = rotation(unit.T)
+    return np.column_stack((*first, *second, *third)).astype(np.float32)
 
 
 def _check_counts(rows: int, columns: int) -> None:

@@ -31,13 +31,8 @@ _WEYL = np.uint64(0x9E3779B9)
 _OTHER_WEYL = np.uint64(0xBB67AE85)
 
 
-def _quantiles() -> Array:
-    normal = NormalDist()
-    values = [round(normal.inv_cdf((number + 0.5) / LEVELS), 10) for number in range(LEVELS)]
-    return np.array(values, np.float32)
-
-
-QUANTILES = _quantiles()
+_SHARES = (np.arange(LEVELS) + 0.5) / LEVELS
+QUANTILES = np.array([round(NormalDist().inv_cdf(share), 10) for share in _SHARES], np.float32)
 
 
 class ErrorModel(NamedTuple):

@@ -21,10 +21,10 @@ from .config import SceneConfig, parse_scene, refuse_hidden
 from .fields import centered, check_points
 from .generators import Draft, drafted
 from .motion import REST, offsets
-from .obstacles import HULL, OWN, Obstacle, hulls_of, obstacles_of
-from .registry import MAX_SOLIDS
+from .obstacles import HULL, OWN, SIZES, Obstacle, hulls_of, obstacles_of
 
 Array = NDArray[np.float64]
+Rows = tuple[tuple[float, ...], ...]
 
 MAX_CELLS = 1 << 26
 """Most cells of a grid, which takes 0.5 GB then."""
@@ -39,21 +39,6 @@ _NOTHING[3] = 1.0
 _MARCHES = 60  # steps along a way, each up to the next solid
 _TOUCH = 1e-3  # m: a solid that is so near is touched
 _CHUNK = 1 << 22  # numbers that a step of `distance` has at once
-
-
-class Shape(NamedTuple):
-    """Kind and size of a solid."""
-
-    kind: str
-    """One of `kernels.KINDS`."""
-    size: Sequence[float]
-    """As MuJoCo has it, m, three numbers; of a height field as of `Solids.halves`."""
-    middle: float = 0.0
-    """How far its center lies from its place along its third axis, m."""
-    grid: Array | None = None
-    """As of `Solids`."""
-    order: Sequence[int] = (0, 1, 2)
-    """Which axes of its geom are its own."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -138,21 +123,35 @@ class Solids:
         )
 
     @classmethod
-    def of_obstacles(cls, obstacles: Sequence[Obstacle]) -> Self:
-        """Those of a file but hulls. Names have object and part, as those of our scenes."""
+    def of_obstacles(cls, obstacles: Sequence[Obstacle], names: Sequence[str] = ()) -> Self:
+        """All but hulls. Without names they have object and part, as those of our scenes."""
         obstacles = [one for one in obstacles if one.kind != HULL]
-        axes = np.zeros((len(obstacles), 3, 3))
-        shapes = []
-        for one, turned in zip(obstacles, axes, strict=True):
-            mujoco.mju_quat2Mat(turned.reshape(9), np.array(one.attitude))
-            a, b, c, *_ = *one.size, 0.0, 0.0, 0.0
-            middle, grid = 0.0, None
-            if one.heights:
-                middle, grid = centered(np.array(one.heights), c)
-            shapes.append(Shape(one.kind, (a, b, c + middle), middle, grid))
-        names = [f"{OWN}/{one.label or one.kind}_{i}/{one.kind}" for i, one in enumerate(obstacles)]
+        count = len(obstacles)
+        names = names or [
+            f"{OWN}/{one.label or one.kind}_{i}/{one.kind}" for i, one in enumerate(obstacles)
+        ]
+        kinds = np.array([kernels.KINDS.index(one.kind) for one in obstacles], np.int8)
         places = np.array([one.position for one in obstacles]).reshape(-1, 3)
-        return cls._of_shapes(names, shapes, places, settled(axes))
+        axes = np.zeros((count, 3, 3))
+        sizes = np.zeros((count, 3))
+        middles = np.zeros(count)
+        grids = np.full(count, None)
+        for i, one in enumerate(obstacles):
+            mujoco.mju_quat2Mat(axes[i].reshape(9), np.array(one.attitude))
+            sizes[i, : len(one.size)] = one.size
+            if one.heights:
+                middles[i], grids[i] = centered(np.array(one.heights), sizes[i, 2])
+        axes = settled(axes)
+        sizes[:, 2] += middles
+        return cls(
+            label=lambda: tuple(names),
+            kinds=kinds,
+            centers=places + middles[:, None] * axes[:, :, 2],
+            axes=axes,
+            halves=_halves(kinds, sizes),
+            motions=np.zeros((count, len(REST))),
+            grids=grids,
+        )
 
     @classmethod
     def of_model(cls, model: MjModel, which: ArrayLike | None = None) -> Self:
@@ -166,44 +165,10 @@ class Solids:
             which = (model.geom_contype | model.geom_conaffinity) != 0
         stands = model.body_weldid[model.geom_bodyid] == 0
         chosen = np.flatnonzero(stands & which).tolist()
-        if len(chosen) > MAX_SOLIDS:
-            raise InputError(f"scene: expected at most {MAX_SOLIDS} solids, got {len(chosen)}")
         data = MjData(model)
         mujoco.mj_kinematics(model, data)
-        names = [_name(model, geom) for geom in chosen]
-        shapes = [_shape_of(model, geom) for geom in chosen]
-        axes = data.geom_xmat[chosen].reshape(-1, 3, 3)
-        orders = np.array([one.order for one in shapes], int).reshape(-1, 1, 3)
-        axes = np.take_along_axis(axes, orders, axis=2)
-        axes[:, :, 0] *= np.linalg.det(axes).round()[:, None]  # right-handed again
-        solids = cls._of_shapes(names, shapes, data.geom_xpos[chosen], axes)
-        for name, kind, half, center in zip(
-            names, solids.kinds, solids.halves.tolist(), solids.centers, strict=True
-        ):
-            if not abs(center).max() <= _SIZE.high:
-                expected = f"solids within {_SIZE.high:g} m of the origin"
-                raise InputError(f"scene: expected {expected}, got {name}")
-            for one in half if kind != kernels.PLANE else ():
-                check(f"scene: half a side of {name}", _SIZE, one)
-        return solids
-
-    @classmethod
-    def _of_shapes(
-        cls, names: Sequence[str], shapes: "Sequence[Shape]", places: Array, axes: Array
-    ) -> Self:
-        """Solids that stand still, in places, m, (N, 3)."""
-        kinds = np.array([kernels.KINDS.index(one.kind) for one in shapes], np.int8)
-        sizes = np.array([one.size for one in shapes], float).reshape(-1, 3)
-        middles = np.array([one.middle for one in shapes], float)[:, None]
-        return cls(
-            label=lambda: tuple(names),
-            kinds=kinds,
-            centers=places + middles * axes[:, :, 2],
-            axes=axes,
-            halves=_halves(kinds, sizes),
-            motions=np.zeros((len(kinds), len(REST))),
-            grids=np.fromiter((one.grid for one in shapes), object, len(kinds)),
-        )
+        obstacles = [obstacle_of(model, data, geom) for geom in chosen]
+        return cls.of_obstacles(obstacles, [_name(model, geom) for geom in chosen])
 
     @classmethod
     def none(cls) -> "Solids":
@@ -443,41 +408,60 @@ def _name(model: MjModel, geom: int) -> str:
     return model.geom(geom).name or f"geom {geom}"
 
 
-def _shape_of(model: MjModel, geom: int) -> Shape:
-    a, b, c = model.geom_size[geom].tolist()
+def obstacle_of(model: MjModel, data: MjData, geom: int) -> Obstacle:
+    """A geom that is no mesh, where it is; as of `Solids.of_model`. Raises `InputError`."""
+    name = _name(model, geom)
     type_ = mjtGeom(model.geom_type[geom])
     kind = type_.name.removeprefix("mjGEOM_").lower()
+    size = model.geom_size[geom]
+    place = data.geom_xpos[geom]
+    axes = data.geom_xmat[geom].reshape(3, 3)
+    heights: Rows = ()
     if type_ == mjtGeom.mjGEOM_PLANE:
         touches = model.geom_contype[geom] or model.geom_conaffinity[geom]
-        is_level = is_ground(model, geom) and min(a, b) > _MARK
-        if not (touches or is_level) and a * b:
-            return Shape("box", (a, b, _SHEET), -_SHEET)
+        is_level = is_ground(model, geom) and size[:2].min() > _MARK
+        if not (touches or is_level) and size[0] * size[1]:
+            kind = "box"
+            size = (*size[:2], _SHEET)
+            place = place - _SHEET * axes[:, 2]
     elif type_ == mjtGeom.mjGEOM_HFIELD:
-        middle, grid = _field_of(model, geom)
-        a, b, _, depth = model.hfield_size[model.geom_dataid[geom]].tolist()
-        return Shape(kind, (a, b, depth + middle), middle, grid)
+        number = model.geom_dataid[geom]
+        size = model.hfield_size[number, [0, 1, 3]]
+        heights = _heights(model, number, name)
     elif type_ == mjtGeom.mjGEOM_ELLIPSOID:
-        order = np.argsort((a, b, c)).tolist()
-        thin, wide, long = sizes = sorted((a, b, c))
-        if thin < wide / 2:
-            return Shape("box", sizes, order=order)
-        return Shape("capsule", (wide, long - wide, 0.0), order=order)
+        order = np.argsort(size)
+        axes = axes[:, order]
+        axes[:, 0] *= np.linalg.det(axes).round()  # right-handed again
+        thin, wide, long = size = size[order]
+        kind = "box"
+        if thin >= wide / 2:
+            kind = "capsule"
+            size = (wide, max(long - wide, _SIZE.low))
     elif kind not in kernels.KINDS:
         expected = ", ".join(kernels.KINDS)
-        got = f"{_name(model, geom)}, a {kind}"
-        raise InputError(f"scene: expected {expected} or ellipsoid, got {got}")
-    return Shape(kind, (a, b, c))
+        raise InputError(f"scene: expected {expected} or ellipsoid, got {name}, a {kind}")
+    quaternion = np.empty(4)
+    mujoco.mju_mat2Quat(quaternion, axes.ravel())
+    try:
+        return Obstacle(
+            kind=kind,
+            size=tuple(map(float, size[: SIZES[kind]])),
+            heights=heights,
+            position=tuple(place.tolist()),
+            quaternion=tuple(quaternion.tolist()),
+        )
+    except InputError as error:
+        raise InputError(f"scene: {name}: {error}") from None
 
 
-def _field_of(model: MjModel, geom: int) -> tuple[float, Array]:
-    """As of `centered`."""
-    number = model.geom_dataid[geom]
+def _heights(model: MjModel, number: int, name: str) -> Rows:
+    """Of a height field, m, to the hundredth of a millimetre."""
     rows, columns = model.hfield_nrow[number], model.hfield_ncol[number]
-    check_points(rows, columns, f"scene: {_name(model, geom)}")
+    check_points(rows, columns, f"scene: {name}")
     first = model.hfield_adr[number]
     data = model.hfield_data[first : first + rows * columns].astype(float)
-    _, _, tall, depth = model.hfield_size[number].tolist()
-    return centered(tall * data.reshape(rows, columns), depth)
+    heights = (model.hfield_size[number, 2] * data).round(5)
+    return tuple(map(tuple, heights.reshape(rows, columns).tolist()))
 
 
 def _halves(kinds: NDArray[np.int8], sizes: Array) -> Array:

@@ -6,13 +6,12 @@ take arrays with the components on their last axis, and any leading axes.
 
 from collections.abc import Sequence
 
-from ..models.matrices import cross, dot
+from ..models.matrices import cross, dot, rotation
 from .elementary import atan2, cos, sin
 from .state import Array, parts_of, square_root, stack
 
 Parts = Sequence[Array]
 Rows = tuple[Parts, Parts, Parts]
-
 
 # ---- of components
 
@@ -41,16 +40,6 @@ def product(a: Parts, b: Parts) -> Parts:
         x * d + w * e + y * g - z * f,
         y * d + w * f + z * e - x * g,
         z * d + w * g + x * f - y * e,
-    )
-
-
-def matrix(quaternion: Parts, twice: Array = 2.0) -> Rows:
-    """Rotation matrix from body to world, three rows; `twice` is 2 over the squared length."""
-    w, x, y, z = quaternion
-    return (
-        (1.0 - twice * (y * y + z * z), twice * (x * y - w * z), twice * (x * z + w * y)),
-        (twice * (x * y + w * z), 1.0 - twice * (x * x + z * z), twice * (y * z - w * x)),
-        (twice * (x * z - w * y), twice * (y * z + w * x), 1.0 - twice * (x * x + y * y)),
     )
 
 
@@ -84,7 +73,7 @@ def _turned(quaternion: Array, vector: Array, sign: float) -> Array:
 
 def axes_of(quaternion: Array) -> Rows:
     """The components of body x, y and z in the world frame, shape (...)."""
-    return transposed(matrix(parts_of(quaternion)))
+    return transposed(rotation(parts_of(quaternion)))
 
 
 def body_x(quaternion: Array) -> Array:
@@ -99,7 +88,7 @@ def body_z(quaternion: Array) -> Array:
 
 def world_z(quaternion: Array) -> Array:
     """Direction of world z in the body frame, shape (..., 3)."""
-    return stack(matrix(parts_of(quaternion))[2])
+    return stack(rotation(parts_of(quaternion))[2])
 
 
 def euler(quaternion: Array) -> tuple[Array, Array, Array]:

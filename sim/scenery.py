@@ -11,7 +11,7 @@ from ..models.errors import InputError
 from ..models.vehicle import Vehicle, can_touch, craft_geoms
 from ..scenes import SceneConfig, kernels
 from ..scenes.config import NEW_SEEDS, refuse_hidden
-from ..scenes.generators import drafted, openings_of
+from ..scenes.generators import drafted
 from ..scenes.motion import REST, offsets
 from ..scenes.obstacles import hulls_of
 from ..scenes.solids import Layouts, Solids
@@ -47,7 +47,7 @@ class Scenery(Kept):
         moves: Whether solids move.
         hidden: Names as of `solids_around`.
         rows: As of `rows_of`; traced while code is compiled.
-        openings: Of each world's layout, as of `generators.openings_of`, shape (W, K, 6); traced
+        openings: Of each world's layout, as of `generators.Draft.ways`, shape (W, K, 6); traced
             likewise.
     """
 
@@ -67,8 +67,8 @@ class Scenery(Kept):
         laid = [self.solids(seed) for seed in self.given]
         self.most: int = max(map(len, laid), default=scene.values.most)
         self.layouts = Layouts.of(*[self._always + one for one in laid])
-        self.openings: Array = np.zeros((worlds, *openings_of(scene, 0).shape))
-        opened = [openings_of(scene, seed) for seed in self.given]
+        self.openings: Array = np.zeros((worlds, *drafted(scene, 0).ways.shape))
+        opened = [drafted(scene, seed).ways for seed in self.given]
         self._openings = np.array([self._checked(one) for one in opened])
         if self.moves:  # each world has a time of its own
             self._motions = np.zeros((worlds, self.most, len(REST)))

@@ -20,7 +20,7 @@ from ...models import matrices
 from ...models.vehicle import Vehicle
 from .. import elementary
 from ..randomize import CENTER
-from ..rotations import matrix, product, transposed
+from ..rotations import product, transposed
 from ..state import Array
 
 Vector = tuple[Array, Array, Array]
@@ -173,7 +173,7 @@ class RigidBody:
             outer = _plus(outer, velocity, -self._drag)
         if off and _is_there(outer):
             # The force at the origin has the torque -c × F about the center of mass.
-            inside = forth(transposed(matrix(quaternion)), outer)
+            inside = forth(transposed(matrices.rotation(quaternion)), outer)
             lever = _cross(_scaled(inside, varying.mass), center)
             turning = _plus(turning, self._turned(lever))
         turning = tuple(
@@ -306,7 +306,7 @@ def forth(matrix: Array, vector: Array) -> Vector:
 def _to_world(quaternion: Array, vector: Vector) -> Vector:
     """A body vector in the world frame."""
     if _is_there(vector[:2]):
-        return forth(matrix(quaternion), vector)
+        return forth(matrices.rotation(quaternion), vector)
     w, x, y, z = quaternion
     up = vector[2]
     twice = up + up

@@ -7,8 +7,8 @@ import numpy as np
 
 from ... import models
 from ...models import InputError
-from ...models.matrices import cross, dot
-from ..rotations import Parts, Rows, add, matrix, product, times, transposed
+from ...models.matrices import cross, dot, rotation
+from ..rotations import Parts, Rows, add, product, times, transposed
 from ..snapshots import Kept
 from ..state import (
     Array,
@@ -225,4 +225,4 @@ def _turned(quaternion: Array, rates: Parts, time: float) -> Rows:
     spin = (1.0, half * rates[0], half * rates[1], half * rates[2])
     turned = product(parts_of(quaternion), spin)
     w, x, y, z = turned
-    return matrix(turned, 2 / (w * w + x * x + y * y + z * z))
+    return rotation(turned, 2 / (w * w + x * x + y * y + z * z))

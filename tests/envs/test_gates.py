@@ -8,7 +8,7 @@ import pytest
 from contracts import NOW, loop_of
 from rotorgram.models import InputError
 from rotorgram.scenes import SceneConfig, Solids
-from rotorgram.scenes.generators import openings_of
+from rotorgram.scenes.generators import drafted
 
 from flights import Shares, state_of, task_of
 
@@ -66,7 +66,7 @@ def test_gates_are_seen_in_the_frame_of_the_action(action: str, expected: list[f
 def test_openings_are_those_of_the_layout(seed: int) -> None:
     scene = SceneConfig.parse(f"gates:{seed},size=15x15")
     solids = Solids.of_layout(scene, seed)
-    openings = openings_of(scene, seed)
+    openings = drafted(scene, seed).ways
     assert openings.shape == (8, 6)
     assert np.hypot(*openings[:, 3:5].T) == pytest.approx(1.0)
     assert solids.distance(openings[:, :3]) == pytest.approx(0.75)  # half of what is inside
@@ -111,7 +111,7 @@ def test_episodes_have_tracks_of_their_own() -> None:
     loop.advance(np.zeros((8, 4)), np.ones(8, bool), list(range(8)))
     for seed, goal in zip(loop.world.scenery.seeds, loop.telemetry["goal"], strict=True):
         scene = loop.config.scene.with_seed(int(seed))
-        assert goal == pytest.approx(openings_of(scene, int(seed))[0, :3])
+        assert goal == pytest.approx(drafted(scene, int(seed)).ways[0, :3])
     assert len(set(loop.world.scenery.seeds.tolist())) == 8
     loop.close()
 

@@ -8,7 +8,7 @@ import pytest
 from contracts import NOW, loop_of
 from rotorgram.models import InputError
 from rotorgram.scenes import SceneConfig, Solids
-from rotorgram.scenes.generators import openings_of
+from rotorgram.scenes.generators import drafted
 
 from flights import Shares, state_of, task_of
 
@@ -66,7 +66,7 @@ def test_the_order_lasts_a_second() -> None:
 def test_one_aisle_of_each_row_is_open(seed: int) -> None:
     scene = SceneConfig.parse(f"aisles:{seed}")
     solids = Solids.of_layout(scene, seed)
-    openings = openings_of(scene, seed)
+    openings = drafted(scene, seed).ways
     assert openings[:, 0] == pytest.approx([-2.5, 2.5])
     for x, door, *_ in openings:
         ends = [(x + 1.2, y, 1.0) for y in (-2.4, 0.0, 2.4)]

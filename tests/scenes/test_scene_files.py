@@ -223,7 +223,7 @@ FIELD = "<asset><hfield name='h' nrow='{0}' ncol='{0}' size='1 1 1 1'/></asset>"
         ),
         ("<worldbody><geom size='nan'/></worldbody>", r"expected MJCF that MuJoCo reads, got: .*"),
         ("<worldbody><geom size='-1'/></worldbody>", r"expected MJCF that MuJoCo reads, got: .*"),
-        ("<worldbody><geom size='9e9'/></worldbody>", r"scene: half a side of geom 0: expected .*"),
+        ("<worldbody><geom size='9e9'/></worldbody>", r"scene: geom 0: obstacle: size: .*"),
         ("<worldbody>", r"expected MJCF that MuJoCo reads, got: .*"),
         ("<include file='/dev/zero'/>", r"file: expected files, got /dev/zero"),
         ("<include file='..'/>", r"file: expected files, got .*"),
@@ -296,3 +296,9 @@ def test_a_file_that_includes_itself_is_refused(tmp_path: Path, tag: str) -> Non
     file.write_text(f'<mujoco><{tag} file="a.xml"/>{closing}{box}</mujoco>')
     with pytest.raises(InputError, match="expected files that do not include themselves, got"):
         Solids.of_scene(str(file))
+
+
+def test_a_round_ellipsoid_is_a_sphere(tmp_path: Path) -> None:
+    content = "<mujoco><worldbody><geom type='ellipsoid' size='1 1 1' pos='0 0 9'/></worldbody>"
+    scene = written(tmp_path, content + "</mujoco>", "ball.xml")
+    assert Solids.of_scene(scene).standing().distance((4.0, 0.0, 9.0)) == pytest.approx(3.0)

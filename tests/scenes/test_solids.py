@@ -173,9 +173,13 @@ def test_what_is_refused() -> None:
         scene.field((0, 0, 2), (1, 1, 1), 0.1)
     with pytest.raises(InputError, match=r"^scene: expected .* or ellipsoid, got it, a mesh"):
         _mesh()
-    with pytest.raises(InputError, match=r"^scene: half a side of it: expected .* got 20000"):
+    with pytest.raises(
+        InputError, match=r"^scene: it: obstacle: size: expected .* m, got \(20000\.0, 1\.0"
+    ):
         solids("box", (2e4, 1.0, 1.0))
-    with pytest.raises(InputError, match=r"^scene: expected solids within 10000 m of the origin"):
+    with pytest.raises(
+        InputError, match=r"^scene: it: obstacle: position: expected .* to 10000 m, got"
+    ):
         solids("box", (1.0, 1.0, 1.0), pos=(2e4, 0.0, 0.0))
 
 
