@@ -153,19 +153,10 @@ def local_env(
     """A vector env in this process, without autoreset."""
     from ..envs.vector import LocalVectorEnv  # what only speaks UDP needs no MuJoCo
 
-    _check_known(command.env_id)
     config = command.env_config(backend=backend)
     with closing(LocalVectorEnv(config, num_envs, autoreset_mode="Disabled")) as env:
         print("flying in this process (--udp: over UDP, with a simulator)")
         yield env
-
-
-def _check_known(env_id: str) -> None:
-    if not is_known(env_id):
-        raise InputError(
-            f"env: expected --env MODULE:{env_id}, "
-            "for the task is not known here without the module that registers it"
-        )
 
 
 @contextmanager
@@ -205,7 +196,7 @@ def remote_env(
                 "key-file, insecure: expected them with --listen, "
                 "got them for a simulator of our own on this machine"
             )
-        _check_known(env_id)
+        task_type(env_id)  # raises for one that is not known here
         config = command.env_config(backend=backend)
         drones = num_envs or command.drones
         opened = spawn_simulator(config, num_envs=drones, record=command.record)

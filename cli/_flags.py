@@ -191,10 +191,7 @@ def parse_value(text: str) -> object:
 
 def parse_address(text: str) -> tuple[str, int]:
     """HOST:PORT as a pair. Raises `InputError`."""
-    host, _, port = text.rpartition(":")
-    is_port = re.fullmatch(r"[0-9]{1,5}", port) is not None and int(port) <= 65535
-    if not host or not is_port:
-        raise InputError(
-            f"address: expected HOST:PORT with a port up to 65535, got {shortened(text)}"
-        )
-    return host, int(port)
+    parts = re.fullmatch(r"(.+):([0-9]{1,5})", text)
+    if not parts:
+        raise InputError(f"address: expected HOST:PORT, got {shortened(text)}")
+    return parts[1], int(parts[2])

@@ -1,10 +1,10 @@
 """The parser of a command's flags: tyro, plus the options of any task and a config's file."""
 
 import re
-from argparse import ArgumentParser
 from collections.abc import Sequence
 from dataclasses import field, replace
 from inspect import cleandoc
+from itertools import pairwise
 from types import UnionType
 from typing import Annotated, TypeVar, Union, get_args, get_origin, get_type_hints
 
@@ -37,12 +37,12 @@ def parse(kind: type[Command], prog: str, words: Sequence[str]) -> Command:
 
     Raises `InputError` if the task, one of its options or a number is not what it should be.
     """
-    given = _given(words)
+    flags = _flags(words)
     command: Command
     if issubclass(kind, EnvFlags):
-        command = _parsed_env(kind, prog, words, given)
+        command = _parsed_env(kind, prog, words, flags)
     else:
-        command = replace(_run_tyro(_for_tyro(kind), prog, words), given=given)
+        command = replace(_run_tyro(_for_tyro(kind), prog, words), given=frozenset(flags))
     if isinstance(command, ModuleFlag) and command.env:
         from ..envs import registry
 
@@ -52,17 +52,16 @@ def parse(kind: type[Command], prog: str, words: Sequence[str]) -> Command:
 
 
 def _parsed_env(
-    kind: type["EnvFlags"], prog: str, words: Sequence[str], given: frozenset[str]
+    kind: type["EnvFlags"], prog: str, words: Sequence[str], flags: dict[str, str]
 ) -> "EnvFlags":
     from ..envs import registry
     from ..envs.config import KEYWORDS
 
-    first_pass = ArgumentParser(prog, add_help=False, allow_abbrev=False)
-    first_pass.add_argument("--env")
-    first_pass.add_argument("--config")
-    found = first_pass.parse_known_args(words)[0]
-    file = _file_values(kind, found.config, found.env) if found.config else {}
-    env_id = found.env or file.get("env", DEFAULT_ENV)
+    given = frozenset(flags)
+    env = flags.get("env")
+    path = flags.get("config")
+    file = _file_values(kind, path, env) if path else {}
+    env_id = env or file.get("env", DEFAULT_ENV)
     listens = "listen" in given or getattr(kind, "listen", None) is not None
     if listens and ":" not in env_id and not registry.is_known(env_id):
         return _merged(_run_tyro(_for_tyro(kind), prog, words), given, {}, file)
@@ -163,12 +162,12 @@ def _for_tyro(kind: type[T], options: type | None = None) -> type[T]:
     return made if issubclass(kind, Command) else immutable(made)
 
 
-def _given(words: Sequence[str]) -> frozenset[str]:
-    """Names of the flags among the words, as fields are named."""
-    names = set()
-    for word in words:
+def _flags(words: Sequence[str]) -> dict[str, str]:
+    """The flags among the words, named as fields are, and the word after each."""
+    flags = {}
+    for word, following in pairwise([*words, ""]):
         if word.startswith("--"):
-            flag = word.removeprefix("--").partition("=")[0].replace("-", "_")
-            prefix, dot, name = flag.rpartition(".")
-            names.add(prefix + dot + name.removeprefix("no_"))
-    return frozenset(names)
+            flag, equals, value = word.removeprefix("--").partition("=")
+            prefix, dot, name = flag.replace("-", "_").rpartition(".")
+            flags[prefix + dot + name.removeprefix("no_")] = value if equals else following
+    return flags

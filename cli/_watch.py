@@ -2,9 +2,8 @@
 
 import logging
 import time
-from collections.abc import Iterator
-from contextlib import closing, contextmanager
-from typing import TYPE_CHECKING, cast
+from contextlib import closing
+from typing import cast
 
 import numpy as np
 
@@ -16,9 +15,6 @@ from ..scenes import SceneConfig, parse_scene
 from ..udp.protocol.messages import Command
 from ..udp.transport.simulator import Simulator
 from ._flags import EnvFlags
-
-if TYPE_CHECKING:
-    from .sim import Sim
 
 _log = logging.getLogger(__name__)
 
@@ -36,12 +32,11 @@ class Watcher:
         self._steps = np.zeros(live.stage.drones, np.int64)
         self._episodes = np.zeros(live.stage.drones, np.int64)
 
-    def __call__(self, cause: Command | None) -> None:
+    def __call__(self, cause: Command) -> None:
         """See what moved the drones; episodes count in which something was flown."""
         count = len(self._steps)
         live = self._live
-        resets = True if cause is None else cause.resets[:count]
-        self._episodes += resets & (self._steps > 0)
+        self._episodes += cause.resets[:count] & (self._steps > 0)
         self._steps = self._loop.steps[:count]
         if live is None or not live.wants or not self._is_open(live):
             return
@@ -61,20 +56,10 @@ class Watcher:
         return False
 
 
-def open_view(command: EnvFlags, drones: int, pace: Pace, flown: SceneConfig) -> closing[LiveView]:
+def open_view(command: EnvFlags, drones: int, flown: SceneConfig, pace: Pace) -> closing[LiveView]:
     """A window with the drones of a world in a scene; it is open within a `with` block.
 
     Raises `InputError` for a scene of several layouts.
     """
     scene = parse_scene(command.shown_scene or flown.shown)
     return closing(LiveView(Stage(scene, drones, vehicle=command.vehicle), pace))
-
-
-@contextmanager
-def watched(simulator: Simulator, command: "Sim") -> Iterator[None]:
-    """Show a simulator during the block."""
-    flown = command.env_config().scene
-    with open_view(command, len(simulator.spec.agents), Pace(0.0), flown) as view:
-        print("shown in the window")
-        simulator.observer = Watcher(view, simulator)
-        yield

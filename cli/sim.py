@@ -1,13 +1,10 @@
 """`rotorgram sim`: the simulator, a UDP client."""
 
-from contextlib import AbstractContextManager, nullcontext
-from typing import TYPE_CHECKING, Literal
+from contextlib import ExitStack
+from typing import Literal
 
 from ..models import InputError
 from ._flags import BackendFlags, WireFlags, Words, parse_address
-
-if TYPE_CHECKING:
-    from ..udp import Simulator
 
 
 class Sim(BackendFlags, WireFlags):
@@ -61,7 +58,18 @@ class Sim(BackendFlags, WireFlags):
         )
         links = simulator.rules.links
         there = f"{len(links)} agents" if several else f"the agent at {self.server}"
-        with simulator, self._shown(simulator):
+        with ExitStack() as opened:
+            opened.enter_context(simulator)
+            if self.view:
+                from ..rendering.live import Pace
+                from ._watch import Watcher, open_view
+
+                drones = len(simulator.spec.agents)
+                view = opened.enter_context(
+                    open_view(self, drones, self.env_config().scene, Pace(0.0))
+                )
+                print("shown in the window")
+                simulator.observer = Watcher(view, simulator)
             here = "{}:{}".format(*simulator.address)
             print(f"simulating at {here} for {there} (Ctrl-C ends)")
             try:
@@ -70,10 +78,3 @@ class Sim(BackendFlags, WireFlags):
                 for link in links:
                     where = " to {}:{}".format(*link.address) if several else ""
                     print(f"wire{where}: {link.client.statistics}")
-
-    def _shown(self, simulator: "Simulator") -> AbstractContextManager[None]:
-        if not self.view:  # nothing that draws is imported
-            return nullcontext()
-        from ._watch import watched
-
-        return watched(simulator, self)

@@ -5,7 +5,6 @@ from typing import Annotated
 from tyro.conf import Positional, arg
 
 from ..agents.registry import AlgorithmName
-from ..models.errors import require
 from ..models.fields import Limits
 from ._flags import AgentFlags, BackendOfPreset
 from ._training import TrainingFlags
@@ -38,8 +37,6 @@ class Train(AgentFlags, TrainingFlags):
 
     def run(self) -> int:
         """Train by these settings, or by those of the folder to resume."""
-        if self.algorithm.startswith("sb3-"):
-            require("torch", "train", self.algorithm)
         from . import _trainer
 
         return _trainer.resume(self, self.resume) if self.resume else _trainer.begin(self)

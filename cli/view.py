@@ -54,7 +54,7 @@ class View(EnvFlags):
                 if flight[0].scene != scene:
                     scene = flight[0].scene
                     opened.close()
-                    live = opened.enter_context(open_view(shown, len(first), pace, scene))
+                    live = opened.enter_context(open_view(shown, len(first), scene, pace))
                 shown_moments = [moments(one) for one in flight]
                 longest = max(map(len, shown_moments))
                 # A drone whose episode has ended stays as it ended.

@@ -85,7 +85,10 @@ def task_type(env_id: str) -> "type[Task]":
     task = _tasks.get(canonical_id(env_id))
     if task is None:
         expected = ", ".join(_tasks)
-        raise InputError(f"env: expected a registered id ({expected}), got {env_id!r}")
+        raise InputError(
+            f"env: expected a registered id ({expected}), or --env MODULE:{env_id} with the module "
+            f"that registers it, got {env_id!r}"
+        )
     if isinstance(task, str):
         module, _, name = task.partition(":")
         task = _tasks[canonical_id(env_id)] = getattr(import_module(module), name)

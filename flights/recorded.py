@@ -8,8 +8,8 @@ from typing import NamedTuple
 import numpy as np
 
 from ..models import InputError
-from ..udp.journal.reader import Recording, Session, Transition
-from ..udp.protocol.messages import State
+from ..udp.journal.reader import Recording, Session
+from ..udp.protocol.messages import FLY, Command, State
 from .trajectories import Ending, Flights, Trajectory
 
 Array = np.ndarray
@@ -90,8 +90,8 @@ def read_episodes(
                 yield from flying[slot].finish()
             yield item.session
             flying[slot] = _SessionReader(item.session, drone, observations)
-        if item.transition:
-            yield from flying[slot].take(item.transition)
+        if isinstance(item.message, State):
+            yield from flying[slot].take(item.message, item.command)
     for reader in flying.values():
         yield from reader.finish()
 
@@ -107,7 +107,7 @@ class _Flight(NamedTuple):
 
 
 class _SessionReader:
-    """Makes trajectories from the transitions of one session."""
+    """Makes trajectories from the States and Commands of one session."""
 
     def __init__(
         self, session: Session, drone: int | None, observations: Collection[str] | None
@@ -123,14 +123,15 @@ class _SessionReader:
         self._flights: dict[int, _Flight] = {}
         self._episodes = [0] * count
 
-    def take(self, transition: Transition) -> Iterator[Trajectory]:
-        """The next transition of the session: the episodes that it ends, one after the other."""
-        state = transition.state
-        command = transition.command
-        if transition.is_gap:
+    def take(self, state: State, command: Command | None) -> Iterator[Trajectory]:
+        """The next State, and the Command before it: the episodes that it ends, one after the
+        other.
+        """
+        if command is None:
             yield from self.finish()
-        for drone in np.flatnonzero(transition.flown & self._chosen).tolist():
-            if command is None or drone not in self._flights:
+            return
+        for drone in np.flatnonzero((command.orders == FLY) & self._chosen).tolist():
+            if drone not in self._flights:
                 continue  # its episode has ended
             flight = self._flights[drone]
             flight.arrays.append(self._arrays(state, drone))
@@ -140,12 +141,11 @@ class _SessionReader:
                 yield from self._end(drone, "terminated")
             elif state.truncated[drone]:
                 yield from self._end(drone, "truncated")
-        for drone in np.flatnonzero(transition.resets & self._chosen).tolist():
+        for drone in np.flatnonzero(command.resets & self._chosen).tolist():
             yield from self._end(drone, "cut off")
             # The first drone's seed counts for its world.
             first = drone - drone % len(self.session.spec.agents)
-            seeds = transition.seeds
-            seed = None if seeds is None else int(seeds[first])
+            seed = None if command.seeds is None else int(command.seeds[first])
             self._flights[drone] = _Flight(seed, [self._arrays(state, drone)], [], [])
 
     def finish(self) -> Iterator[Trajectory]:

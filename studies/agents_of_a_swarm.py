@@ -100,22 +100,20 @@ class Twin:
         self.counts = Counter({f"absent_{kind}": 0 for kind in kinds})
         self.shown = np.zeros((AGENTS, 3), np.float32)
 
-    def __call__(self, cause: Command | None) -> None:
+    def __call__(self, cause: Command) -> None:
         loop = self.loop
         rules = self.simulator.rules
-        everybody = np.ones(AGENTS, bool)
-        nothing = np.zeros((AGENTS, 1), np.float32)
-        if cause is None:
-            seed = rules.seed
-            loop.advance(nothing, everybody, None if seed is None else [seed] * AGENTS)
-            self.absent = ~everybody
+        begins = bool(cause.resets.all())
+        if begins:
+            loop.advance(cause.actions, cause.resets, cause.seeds)
+            self.absent = np.zeros(AGENTS, bool)
         for number, link in enumerate(rules.links):
             is_new = link.participation != "flying" and not self.absent[number]
             if is_new and not loop.out[number]:
                 self.absent[number] = True
                 came_back = link.participation == "ready"
                 self.counts[f"absent_{'coming' if came_back else link.participation}"] += 1
-        if isinstance(cause, Command):
+        if not begins:
             flying = ~(self.absent | loop.out)
             for drone in range(AGENTS):
                 right = action_of(self.shown[drone]) if flying[drone] else np.float32(0.0)

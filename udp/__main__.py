@@ -39,21 +39,15 @@ def main() -> int:
 
 
 def _fly(simulator: Simulator) -> int:
-    ended: list[int] = []
-
-    def end(number: int, _: object) -> None:
-        ended.append(number)
-        simulator.stop()
-
     def stop_with_stdin() -> None:
         while os.read(0, 1024):
             pass
         simulator.stop()
 
-    signal.signal(signal.SIGTERM, end)
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(128 + signal.SIGTERM))
     Thread(target=stop_with_stdin, daemon=True).start()
     simulator.run()
-    return 128 + ended[0] if ended else 0
+    return 0
 
 
 def read_arguments(line: bytes) -> tuple[EnvConfig, dict[str, Any]]:

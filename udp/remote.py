@@ -152,10 +152,10 @@ class RemoteEnv(_Remote, gym.Env[Observation, ArrayLike]):
         self._flying = False
         self.connect()
         seeds = None if seed is None else np.array([seed], np.uint64)
-        was_reset = False
-        while not was_reset:  # a simulator that has come instead was not
+        while True:
             self._agent.exchange({0: (self._nothing, _RESET, seeds)})
-            was_reset = not self._agent.lost[0]
+            if not self._agent.lost[0]:
+                break  # else one has come instead that was not reset
         self._flying = True
         self._state = self._agent.states[0]
         return self._observation(), self._info()
@@ -304,8 +304,8 @@ class RemoteVectorEnv(_Remote, AdvancingVectorEnv, VectorEnv[Observation, ArrayL
         seeds = self._seeds(seed)
         self._reasons = None
         if not in_flight:
-            self.done = self.out = np.zeros(self.num_envs, bool)
-            self._idle = np.ones(self.num_envs, bool)  # those that no reset has begun
+            self.done = self.out = self._nobody
+            self._idle = self._everybody  # those that no reset has begun
             self._flying = True
         self.advance(self._nothing, mask, seeds, ~mask)
         return self.observations, self._info(mask)

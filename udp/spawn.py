@@ -22,6 +22,7 @@ from .transport.agent import AgentSettings
 
 Remote = RemoteEnv | RemoteVectorEnv
 _COMMAND = (sys.executable, "-P", "-m", "rotorgram.udp")
+_ANY = ("127.0.0.1", 0)
 _START_TIMEOUT = 60.0
 _ANSWER_TIMEOUT = 10.0
 _STOP_TIMEOUT = 5.0
@@ -46,8 +47,7 @@ def spawn_simulator(
         PeerClosed: The simulator did not start, or ended: its own sentence, or its last words.
         PeerSilent: The simulator runs and does not answer.
     """
-    _check_importable(config)
-    config = config.embedded()  # before a record is begun
+    config = _importable(config)  # before a record is begun
     count = config.drones if num_envs is None else num_envs
     settings: AgentSettings = {
         "env_id": config.env_id,
@@ -56,13 +56,12 @@ def spawn_simulator(
         "timeout": _ANSWER_TIMEOUT,
         "record": record,
     }
-    here = ("127.0.0.1", 0)
     env: Remote
     if num_envs is None and count == 1:
-        env = RemoteEnv(here, connect=False, **settings)
+        env = RemoteEnv(_ANY, connect=False, **settings)
     else:
         env = RemoteVectorEnv(
-            here, num_envs=count, autoreset_mode="Disabled", connect=False, **settings
+            _ANY, num_envs=count, autoreset_mode="Disabled", connect=False, **settings
         )
     with TemporaryFile("w+") as said:
         process = start_simulator(config, env.address, said, num_envs=count)
@@ -94,7 +93,7 @@ def start_simulator(
 
     `settings` are keyword arguments of `Simulator`.
     """
-    _check_importable(config)
+    config = _importable(config)
     # A second thread of torch makes small tensors slower, and takes the agent's core.
     around = {"OMP_NUM_THREADS": "1", **os.environ, "PYTHONSAFEPATH": "1"}
     # In a group of its own: a signal to ours is for the agent, which closes the exchange.
@@ -102,10 +101,10 @@ def start_simulator(
         _COMMAND, stdin=subprocess.PIPE, stderr=stderr, env=around, process_group=0
     )
     arguments = {
-        "config": config.embedded().to_dict(),
+        "config": config.to_dict(),
         "module": config.module,
         "server": server,
-        "bind": ("127.0.0.1", 0),
+        "bind": _ANY,
         **settings,
     }
     assert process.stdin is not None
@@ -115,14 +114,17 @@ def start_simulator(
     return process
 
 
-def _check_importable(config: EnvConfig) -> None:
-    """Refuse a task that the simulator's process cannot import. Raises `InputError`."""
+def _importable(config: EnvConfig) -> EnvConfig:
+    """The config with the content of its files. Raises `InputError` for a task that the simulator's
+    process cannot import.
+    """
     known = registry.is_known(config.env_id)
     if known and registry.task_type(config.env_id).__module__ == "__main__":
         raise InputError(
             "env: expected a task of a module, for the simulator's process to import, got "
             f"{config.env_id} of this program"
         )
+    return config.embedded()
 
 
 def _connect(env: Remote, process: subprocess.Popen[bytes]) -> None:

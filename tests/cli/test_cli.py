@@ -187,7 +187,7 @@ def test_a_task_of_the_working_directory(tmp_path: Path) -> None:
     done = shell(f"rotorgram evaluate {tmp_path}/run --episodes 1")
     assert done.returncode == 1
     assert done.stderr.count("\n") == 1
-    assert "expected --env MODULE:Low-v0" in done.stderr
+    assert "or --env MODULE:Low-v0 with the module" in done.stderr
     agent = start("serve", tmp_path / "run", "--listen", "127.0.0.1:0", "--episodes", 1)
     assert agent.stdout is not None
     server = agent.stdout.readline().split()[5]

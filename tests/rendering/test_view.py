@@ -300,16 +300,15 @@ def simulator_of(*heights: float, rotors: int = 4) -> Any:
     spec = env_spec(EnvConfig.from_keywords(ELEVATION, vehicle=HEXA if rotors == 6 else None))
     loop = SimpleNamespace(spec=spec, telemetry=telemetry, instruments=())
 
-    def advance(cause: Command | None = None) -> Command | None:
-        """Steps and rewards as `Loop` has them after a Command; otherwise as after a reset."""
-        flies = cause.orders == 0 if isinstance(cause, Command) else np.zeros(drones, bool)
-        keeps = ~cause.resets if isinstance(cause, Command) else flies
-        loop.steps = np.where(keeps, loop.steps + flies, 0)
+    def advance(cause: Command) -> Command:
+        """Steps and rewards as `Loop` has them after a Command."""
+        flies = cause.orders == 0
+        loop.steps = np.where(cause.resets, 0, loop.steps + flies)
         loop.rewards = np.where(flies, 0.25, 0.0)
         return cause
 
     loop.steps = np.zeros(drones, int)
-    advance()
+    loop.rewards = np.zeros(drones)
     return SimpleNamespace(spec=spec, stepped=loop, advance=advance)
 
 
@@ -341,8 +340,8 @@ def test_a_watcher_counts_steps_and_episodes_of_each_drone() -> None:
     view = RecordingView(Stage("plain", 2))
     simulator = simulator_of(4.0, 6.0, 8.0)
     watcher = Watcher(view, simulator)  # type: ignore[arg-type]
-    causes: list[Command | None] = [
-        None,
+    causes = [
+        command("r", "r", "r"),  # the simulator's own first reset
         command("r", "r", "r"),  # as an agent begins: nothing was flown yet
         command("s", "s", "s"),
         command("s", "f", "s"),
@@ -369,7 +368,7 @@ def test_a_watcher_counts_steps_and_episodes_of_each_drone() -> None:
 
 def test_a_watcher_shows_the_rotors_that_there_are() -> None:
     view = RecordingView(Stage("plain", vehicle=HEXA))
-    Watcher(view, simulator_of(4.0, rotors=6))(None)  # type: ignore[arg-type]
+    Watcher(view, simulator_of(4.0, rotors=6))(command("r"))  # type: ignore[arg-type]
     assert view.drawn[0][0].thrusts == (9.0,) * 6
 
 
@@ -377,7 +376,7 @@ def test_a_pause_freezes_the_picture_alone() -> None:
     view = RecordingView(Stage("plain"))
     simulator = simulator_of(5.0)
     watcher = Watcher(view, simulator)  # type: ignore[arg-type]
-    watcher(None)
+    watcher(command("r"))
     view.pace.press("pause")
     for _ in range(3):
         watcher(simulator.advance(command("s")))  # returns: lock-step goes on

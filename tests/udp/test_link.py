@@ -178,7 +178,9 @@ def test_only_what_the_table_says_can_be_sent() -> None:
 
 
 @BOTH
-def test_a_repeat_is_the_same_bytes_and_gets_the_same_answer(sealed: bool) -> None:
+def test_a_repeat_is_the_same_bytes_and_gets_the_same_answer(
+    sealed: bool, caplog: pytest.LogCaptureFixture
+) -> None:
     client = simulator(sealed=sealed)
     server = agent(sealed=sealed)
     Pair(client, server, lossy(0)).run(3)
@@ -193,6 +195,8 @@ def test_a_repeat_is_the_same_bytes_and_gets_the_same_answer(sealed: bool) -> No
         assert server.receive(first[0], HERE, 1.0) is None
         assert outgoing(server) == answer
     assert server.statistics.counters["duplicate"] == 3
+    assert server.statistics.last_error == ""
+    assert not caplog.messages  # every network does it
 
 
 def test_no_resend_on_a_clean_wire_and_few_on_one_that_slows_down() -> None:  # fault 16
@@ -266,7 +270,7 @@ def test_an_agent_that_waits_for_others_is_not_silent() -> None:
     assert not link.handle_timer(19.0)
 
 
-def test_a_missing_of_other_fragments_changes_nothing() -> None:
+def test_a_missing_of_other_fragments_changes_nothing(caplog: pytest.LogCaptureFixture) -> None:
     wire = Wire("agent", False)
     link = to(simulator(), "waiting", wire)
     for kind, count in ((4, 1), (4, 2), (5, 1)):
@@ -275,6 +279,8 @@ def test_a_missing_of_other_fragments_changes_nothing() -> None:
         )
         assert link.receive(wire(missing), 9.0) is None
     assert dropped(link) == {"stale": 3}
+    assert link.statistics.last_error == ""
+    assert not caplog.messages
     assert not outgoing(link)
     assert not link.handle_timer(10.0)
 
@@ -501,8 +507,8 @@ def test_refusals_and_their_size() -> None:
 def test_versions_and_critical_extensions() -> None:  # fault 18
     critical = (Extension(number=9, value=b"", critical=True),)
     for message, words in (
-        (hello(spec=LONG, versions=(1, 1)), "version 2"),
-        (hello(spec=LONG, extensions=critical), "critical extension of type 9"),
+        (hello(spec=LONG, versions=(1, 1)), "versions 1 to 1, the agent 2"),
+        (hello(spec=LONG, extensions=critical), "no critical extension, got type 9"),
     ):
         server = agent()
         server.receive(binary.encode(message), HERE, 0.0)

@@ -227,7 +227,8 @@ def test_an_agent_that_came_back_does_not_hide_the_seeds_of_the_others() -> None
     swarm.say(1, RESET, seed=9)
     swarm.pump()
     assert swarm.world.seeds[1:] == [[9, 9]]
-    assert swarm.rules.seed == 9
+    assert swarm.rules.cause is not None
+    assert swarm.rules.cause.seeds.tolist() == [9, 9]
     assert swarm.participations == ["flying"] * 2
 
 

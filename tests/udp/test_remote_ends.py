@@ -301,11 +301,11 @@ def test_a_pause_of_its_own_does_not_end_a_simulator(  # fault 25
     monkeypatch.setattr(driver, "time", SimpleNamespace(monotonic=lambda: now[0]))
     with plain_socket() as nobody, Simulator(server=nobody.getsockname(), bind=ANY) as simulator:
 
-        def receive(_: float) -> None:  # the process was stopped meanwhile
+        def receive(*_: object) -> None:  # the process was stopped meanwhile
             now[0] += 1e4
             if now[0] > 3e4:
                 simulator.stop()
             raise TimeoutError
 
-        monkeypatch.setattr(simulator, "_receive", receive)
+        monkeypatch.setattr(driver.Port, "receive", receive)
         assert simulator.run() == "the simulator was stopped"

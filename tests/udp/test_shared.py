@@ -26,6 +26,7 @@ from rotorgram.udp import (
 )
 from rotorgram.udp.journal.replay import Verification
 from rotorgram.udp.protocol.auth import write_key
+from rotorgram.udp.protocol.messages import Command
 from rotorgram.udp.remote_parallel import RemoteParallelEnv
 from swarms import RISE
 
@@ -217,8 +218,8 @@ def test_drones_of_one_that_is_killed_hold_and_it_comes_back() -> None:
         rules = running.simulator.rules
         lost: list[tuple[int, int]] = []  # episodes, and steps that were flown without the victim
 
-        def watch(cause: object) -> None:
-            if cause is not None and rules.links[1].participation != "flying":
+        def watch(cause: Command) -> None:
+            if not cause.resets.any() and rules.links[1].participation != "flying":
                 lost.append((rules.episodes, rules.steps))
 
         running.simulator.observer = watch

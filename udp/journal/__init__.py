@@ -3,7 +3,6 @@
 from ...models.errors import require
 
 require("mcap", "record", "the journal of a flight")
-require("zstandard", "record", "the journal of a flight")
 
 from .reader import Item, Recording, Session, Summary  # noqa: E402
 from .writer import Journal  # noqa: E402

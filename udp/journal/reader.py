@@ -9,7 +9,6 @@ from functools import cached_property
 from pathlib import Path
 from typing import BinaryIO, NamedTuple
 
-import numpy as np
 import zstandard
 from mcap import records
 from mcap.stream_reader import StreamReader, breakup_chunk
@@ -22,7 +21,6 @@ from ..protocol import binary
 from ..protocol.errors import DecodeError
 from ..protocol.layout import MAX_MESSAGE, Layout
 from ..protocol.messages import (
-    FLY,
     Close,
     Command,
     Hello,
@@ -32,32 +30,13 @@ from ..protocol.messages import (
     Unknown,
     Welcome,
 )
-from ..protocol.party import Mask, Seeds, first_seeds
+from ..protocol.party import first_seeds, reset_of_all
 from .writer import ABOUT, FORMAT
 
 MAX_CHUNK = 2 * MAX_MESSAGE
 """Most bytes of a record or of a decompressed chunk that is read. Ours are of 64 KiB, or of one
 message and 256 KiB where that is longer."""
 _TOPIC = re.compile(r"/slot([0-9]{1,9})/(state|command|events)")
-
-
-class Transition(NamedTuple):
-    """A State, and the Command or reset before it."""
-
-    state: State
-    command: Command | None
-    """None: the first State of its session, or one whose Command is missing in the journal."""
-    flown: Mask
-    """Drones that took a step, shape (N,)."""
-    resets: Mask
-    """Drones that were reset, shape (N,)."""
-    seeds: Seeds | None
-    """Of the drones that were reset, shape (N,). None: their generators went on."""
-
-    @property
-    def is_gap(self) -> bool:
-        """Whether the Command before the State is missing."""
-        return self.command is None and not self.resets.any()
 
 
 @dataclass(eq=False)
@@ -103,8 +82,8 @@ class Session:
         """Of the reset before the first State."""
         return self.welcome.first_seed if self.welcome else self.hello.session
 
-    def take(self, message: Message, time: int) -> Transition | None:
-        """Take the next message: the transition that a State completes; None for any other."""
+    def take(self, message: Message, time: int) -> Command | None:
+        """Take the next message: the Command before a State; None for any other."""
         self.last = time
         match message:
             case State():
@@ -123,19 +102,16 @@ class Session:
                 self.ending = "the agent does not know this session"
         return None
 
-    def _take_state(self, message: State) -> Transition:
+    def _take_state(self, message: State) -> Command | None:
         self.states += 1
         before = self._sequence
         self._sequence = message.sequence
-        nobody = np.zeros(self.num_envs, bool)
         if before is None:
-            seeds = first_seeds(self.seed, self.num_envs)
-            return Transition(message, None, nobody, ~nobody, seeds)
+            return reset_of_all(self.layout, first_seeds(self.seed, self.num_envs))
         command = self._command
-        if command is None or not before == command.sequence == message.sequence - 1:
-            return Transition(message, None, nobody, nobody, None)
-        flown = np.asarray(command.orders == FLY)
-        return Transition(message, command, flown, command.resets, command.seeds)
+        if command and before == command.sequence == message.sequence - 1:
+            return command
+        return None
 
     def __str__(self) -> str:
         return f"session {self.index} (slot {self.slot}, {self.hello.session:016x})"
@@ -160,8 +136,9 @@ class Item(NamedTuple):
     message: Message
     datagram: bytes
     """Its binary datagram, not sealed and not cut into fragments."""
-    transition: Transition | None
-    """What a State completes; None of any other message."""
+    command: Command | None
+    """That before a State: before the first of a session a reset of all drones. None: it is missing
+    in the journal, or the message is no State."""
 
     @property
     def begins(self) -> bool:
@@ -243,8 +220,8 @@ class Recording:
                         f"{self.path}: expected a message of the session of the last Hello, "
                         f"got a {type(message).__name__} of {message.session:016x}"
                     )
-                transition = session.take(message, record.log_time)
-                yield Item(session, record.log_time, message, datagram, transition)
+                command = session.take(message, record.log_time)
+                yield Item(session, record.log_time, message, datagram, command)
 
     def _records(self) -> Iterator[records.McapRecord]:
         with self.path.open("rb") as file:

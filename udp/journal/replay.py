@@ -8,14 +8,14 @@ from typing import NamedTuple
 import numpy as np
 
 from ...envs.config import EnvConfig
-from ...envs.registry import is_known
+from ...envs.registry import task_type
 from ...envs.spec import component_names
 from ...models import Backend
 from ...models.errors import InputError, printable, shortened
 from ..protocol.layout import Array
-from ..protocol.messages import State
+from ..protocol.messages import Command, State
 from ..transport.stepped import Steppable, make_stepped
-from .reader import Item, Recording, Session, Transition, count_of
+from .reader import Item, Recording, Session, count_of
 
 _SAME = ("vehicle_hash", "agents", "observation", "action", "telemetry", "control_period")
 """Fields of the spec that have to be those of the recorded one."""
@@ -72,12 +72,11 @@ class SessionVerdict:
 
     def take(self, item: Item) -> None:
         """Repeat a message."""
-        transition = item.transition
-        if self.problem or transition is None:
+        state = item.message
+        if self.problem or not isinstance(state, State):
             return
-        state = transition.state
         try:
-            loop = self._repeat(transition)
+            loop = self._repeat(state, item.command)
         except Exception as error:  # the env's: the recorded run ended with it too
             what = str(error) or type(error).__name__
             self.problem = f"State {state.sequence} cannot be repeated: {what}"
@@ -95,31 +94,20 @@ class SessionVerdict:
             self._loop.close()
             self._loop = None
 
-    def _repeat(self, transition: Transition) -> Steppable:
+    def _repeat(self, state: State, command: Command | None) -> Steppable:
         """Bring the drones to that State."""
-        command = transition.command
-        resets = transition.resets
-        seeds = transition.seeds
         if self._loop is None:
             self._loop = self._make()
-        loop = self._loop
-        if transition.is_gap:
-            number = transition.state.sequence - 1
-            raise InputError(f"expected Command {number} before it, got none of that number")
         if command is None:
-            loop.advance(self.session.layout.actions.zeros(), resets, seeds, None)
-        else:
-            loop.advance(command.actions, resets, seeds, command.frozen)
-        return loop
+            number = state.sequence - 1
+            raise InputError(f"expected Command {number} before it, got none of that number")
+        self._loop.advance(command.actions, command.resets, command.seeds, command.frozen)
+        return self._loop
 
     def _make(self) -> Steppable:
         """The drones. Raises `InputError` unless their arrays are those of the recorded spec."""
         spec = self.session.spec
-        if not is_known(spec.env_id):
-            raise InputError(
-                f"expected a registered env id, got {spec.env_id!r}: "
-                "--env MODULE:NAME names the module that registers it"
-            )
+        task_type(spec.env_id)  # raises for one that is not known here: no file names a module
         keywords = {**self.flown, **spec.options}
         config = EnvConfig.from_keywords(spec.env_id, drones=len(spec.agents), **keywords)
         loop = make_stepped(config, self.session.num_envs, {})
@@ -157,8 +145,8 @@ class Verification(Recording):
         backend: Backend | None = None,
     ) -> None:
         super().__init__(path)
-        recorded = self.about.get("backend", "mujoco")
-        flown: dict[str, object] = {"vehicle": vehicle, "backend": backend or recorded}
+        stepped_by = backend or self.about.get("backend", "mujoco")
+        flown: dict[str, object] = {"vehicle": vehicle, "backend": stepped_by}
         self.sessions: list[SessionVerdict] = []
         flying: dict[int, SessionVerdict] = {}  # the last of each slot
         try:

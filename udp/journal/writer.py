@@ -5,7 +5,6 @@ message in it as hexadecimal digits.
 """
 
 import json
-import logging
 import os
 import platform
 import signal
@@ -21,7 +20,7 @@ from mcap.writer import Writer
 
 from ...models.files import removed_on_error, software_versions
 from ..protocol.messages import Command, Hello, Message, State
-from ..transport.stepped import Steppable
+from ..protocol.statistics import warn
 
 ABOUT = "rotorgram"  # name of the metadata about the whole file
 FORMAT = "4"  # version of the file's content, beside the protocol's in each datagram
@@ -29,8 +28,6 @@ FORMAT = "4"  # version of the file's content, beside the protocol's in each dat
 _CHUNK = 1 << 16  # bytes; 2 ms to write
 _SECOND = 10**9
 _BUFFER = 1 << 20  # bytes; more than a chunk, so that its records reach the file at once
-
-_log = logging.getLogger("rotorgram.udp")
 
 
 class Journal:
@@ -140,8 +137,10 @@ class Journal:
                     self._writer.finish()
                     self._closed = True
         except OSError as error:
-            sentence = "record: writing %s failed (%s): the flight goes on, its journal ends here"
-            _log.warning(sentence, self._path, error.strerror or error)
+            warn(
+                f"record: writing {self._path} failed ({error.strerror or error}): "
+                "the flight goes on, its journal ends here"
+            )
 
     @contextmanager
     def _writing(self) -> Iterator[None]:
@@ -168,16 +167,6 @@ class Journal:
         return json.dumps(words).encode()
 
 
-def about_of(stepped: Steppable) -> dict[str, str]:
-    """Config and backend of a `Loop` as metadata; else empty."""
-    from ...envs.loop import Loop
-
-    if not isinstance(stepped, Loop):
-        return {}
-    config = stepped.config
-    return {"config": json.dumps(config.to_dict()), "backend": config.backend.name}
-
-
 @contextmanager
 def _deferred_signals() -> Iterator[None]:
     """Delay the handlers of Ctrl-C and SIGTERM to the end of the block."""
@@ -185,15 +174,17 @@ def _deferred_signals() -> Iterator[None]:
         yield
         return
     came: list[int] = []
-    handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    handlers = {
+        number: handler
+        for number in (signal.SIGINT, signal.SIGTERM)
+        if (handler := signal.getsignal(number)) is not None  # else it cannot be set again
+    }
     try:
-        for number, handler in handlers.items():
-            if handler is not None:  # None: not set by Python, and cannot be set again
-                signal.signal(number, lambda signum, _: came.append(signum))
+        for number in handlers:
+            signal.signal(number, lambda signum, _: came.append(signum))
         yield
     finally:
         for number, handler in handlers.items():
-            if handler is not None:
-                signal.signal(number, handler)
+            signal.signal(number, handler)
         for each in came:
             signal.raise_signal(each)

@@ -11,13 +11,13 @@ authenticates; it does not encrypt.
 import os
 import secrets
 import stat
-from contextlib import suppress
 from hashlib import blake2b
 from hmac import compare_digest
 from pathlib import Path
 from typing import Literal
 
 from ...models.errors import InputError
+from ...models.files import removed_on_error
 from .errors import Forged
 
 KEY_SIZE = 32  # bytes of a shared key
@@ -130,10 +130,5 @@ def write_key(path: Path) -> None:
     except FileExistsError as error:
         sentence = "expected a new file, got one that is there; a key is never replaced"
         raise FileExistsError(error.errno, sentence, str(path)) from None
-    try:
-        with open(descriptor, "w", encoding="ascii") as file:
-            file.write(secrets.token_hex(KEY_SIZE) + "\n")
-    except OSError as error:
-        with suppress(OSError):
-            os.unlink(path)
-        raise OSError(error.errno, error.strerror, str(path)) from None
+    with removed_on_error(path), open(descriptor, "w", encoding="ascii") as file:
+        file.write(secrets.token_hex(KEY_SIZE) + "\n")

@@ -24,6 +24,7 @@ from .messages import (
     Alive,
     Close,
     Command,
+    Extension,
     Hello,
     Message,
     Missing,
@@ -66,14 +67,20 @@ _TOO_EARLY = 1.5  # factor of the estimated round trip when answers come twice
 _SOON = 0.25  # an agent that has waited for a State for less needs no Alive, s
 
 
-def new_session() -> int:
-    """A random session number, not 0."""
+def random_number() -> int:
+    """A random 64-bit number, not 0: of a session, or a nonce."""
     return secrets.randbits(64) or 1
 
 
-def critical_extension(message: Hello | Welcome) -> int | None:
-    """Number of the first critical extension: we know none."""
-    return next((each.number for each in message.extensions if each.critical), None)
+def mismatch(hello: Hello, version: int, extensions: tuple[Extension, ...]) -> str:
+    """Why the two sides cannot speak with each other, in a sentence; "" if they can."""
+    low, high = hello.versions
+    if not low <= version <= high:
+        return f"the simulator speaks protocol versions {low} to {high}, the agent {version}"
+    for each in extensions:
+        if each.critical:  # we know none
+            return f"expected no critical extension, got type {each.number}"
+    return ""
 
 
 def largest_datagram(peer: Address) -> int:
@@ -202,7 +209,7 @@ class Client:
     largest: int = NEAR
     by_text: bool = False
     key: Key | None = None
-    draw_session: Callable[[], int] = new_session
+    draw_session: Callable[[], int] = random_number
 
     def __post_init__(self) -> None:
         if self.by_text:
@@ -276,8 +283,8 @@ class Client:
     def close(self, reason: str, now: float) -> None:
         """End the exchange. An agent that has welcomed this simulator is told, until it answers."""
         if ("sent", Close) in SIMULATOR[self.state]:
-            number = self.sequence
-            close = Close(session=self.hello.session, sequence=number, reason=one_line(reason))
+            session = self.hello.session
+            close = Close(session=session, sequence=self.sequence, reason=one_line(reason))
             self._send(close, now)
         elif self.state != "closing":
             self._give_up()  # a Hello that was not answered is not repeated
@@ -323,7 +330,7 @@ class Client:
         if then is None or (number != self.sequence and not isinstance(message, Close)):
             if isinstance(message, Command) and self.sequence - message.sequence <= 1:
                 self._round_trips.answered_again()
-            self._drop("stale", "", now)
+            self.statistics.counters["stale"] += 1
             return None
         return self._take(message, then, plain, now)
 
@@ -366,9 +373,11 @@ class Client:
         if isinstance(message, Missing | Wait | Alive):
             self._wait_on(message, now)
             return None
-        if isinstance(message, Welcome) and (reason := self._unfit(message)):
-            self._drop("malformed", reason, now)
-            return None
+        if isinstance(message, Welcome):
+            reason = mismatch(self.hello, message.version, message.extensions)
+            if reason:
+                self._drop("malformed", reason, now)
+                return None
         was_closing = self.state == "closing"
         self.state = then
         self._record(message, plain)
@@ -397,7 +406,7 @@ class Client:
             is_ours = message.kind == binary.peek(self._transfer.message)[0]
             fragments = self._transfer.resend(message) if is_ours else []
             if not fragments:
-                self._drop("stale", "", now)
+                self.statistics.counters["stale"] += 1
                 return
             self.statistics.counters["resent"] += 1
             self._round_trips.sent(now)
@@ -442,7 +451,7 @@ class Client:
             return None
         is_due = self.state == "waiting" and sequence == self.sequence
         if not is_due or kind != binary.COMMAND | binary.FRAGMENT:
-            self._drop("stale", "", now)
+            self.statistics.counters["stale"] += 1
             return None
         whole = self._assembler.take(fragment)
         self._progress(now)
@@ -455,14 +464,6 @@ class Client:
         """The agent is there and works on the outstanding message."""
         self._tries = 1
         self.resend_at = now + self._round_trips.wait(1)
-
-    def _unfit(self, welcome: Welcome) -> str:
-        """The reason to refuse a Welcome, or ""."""
-        low, high = self.hello.versions
-        if not low <= welcome.version <= high:
-            return f"Welcome: expected version {low} to {high}, got {welcome.version}"
-        unknown = critical_extension(welcome)
-        return "" if unknown is None else f"Welcome: expected no critical extension {unknown}"
 
     def begin_again(self, now: float) -> None:
         """Say Hello in a new session to an agent that knows nothing of this one, or is silent."""

@@ -17,7 +17,6 @@ import numpy as np
 from . import binary
 from .binary import HEADER_SIZE
 from .errors import DecodeError
-from .layout import MAX_MESSAGE
 from .messages import Missing
 
 NEAR = 65_507 - 24
@@ -106,7 +105,7 @@ class Assembler:
     """
 
     def __init__(self, largest: int) -> None:
-        self._largest = min(largest, MAX_MESSAGE)
+        self._largest = largest
         self._begin((0, 0, -1), 0)
 
     def take(self, fragment: bytes) -> bytes | None:

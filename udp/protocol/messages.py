@@ -26,10 +26,12 @@ FREEZE = 2  # order to a drone: fly its action, reset instead of it, or do nothi
 _CONTROL = re.compile(r"[\x00-\x1f\x7f-\x9f]")
 
 
-def one_line(text: str) -> str:
-    """Any text made fit for a message: no control characters, at most `MAX_TEXT` bytes."""
+def one_line(text: str, most: int = MAX_TEXT) -> str:
+    """Any text made fit for a message: no control characters, at most `MAX_TEXT` bytes, or fewer
+    if they are told.
+    """
     raw = _CONTROL.sub(" ", text).encode(errors="replace")
-    return raw[:MAX_TEXT].decode(errors="ignore")
+    return raw[: min(most, MAX_TEXT)].decode(errors="ignore")
 
 
 def _check_text(name: str, text: str) -> None:

@@ -117,8 +117,7 @@ class WorldRules:
     Attributes:
         links: The agents.
         reason: Why the flight has ended; None before.
-        cause: The Command of the last step; None: a reset of all drones.
-        moved: Whether the world has moved since the driver looked.
+        cause: The Command that moved the world; the driver sets it to None when it has looked.
     """
 
     world: World
@@ -129,7 +128,6 @@ class WorldRules:
     def __post_init__(self) -> None:
         self.reason: str | None = None
         self.cause: Command | None = None
-        self.moved = False
         self._due: Links = []  # of States
 
     def start(self, now: float) -> None:
@@ -189,12 +187,6 @@ class WorldRules:
                 now,
             )
 
-    def _reset_all(self, seeds: Seeds | None) -> None:
-        everybody = np.ones(self.layout.drones, bool)
-        self.world.advance(self.layout.actions.zeros(), everybody, seeds, None)
-        self.cause = None
-        self.moved = True
-
     def _lose_silent(self, link: AgentLink, why: str) -> None:
         raise NotImplementedError
 
@@ -204,6 +196,13 @@ def first_seeds(seed: int, drones: int) -> Seeds:
     return np.uint64(seed) + np.arange(drones, dtype=np.uint64)
 
 
+def reset_of_all(layout: Layout, seeds: Seeds | None) -> Command:
+    """A Command that resets every drone, such as the simulator's own first one."""
+    orders = np.full(layout.drones, RESET, np.uint8)
+    actions = layout.actions.zeros()
+    return Command(session=0, sequence=0, actions=actions, orders=orders, seeds=seeds)
+
+
 class OneAgent(WorldRules):
     """One agent commands every drone, each by its own order."""
 
@@ -211,23 +210,24 @@ class OneAgent(WorldRules):
         super().__post_init__()
         (self._link,) = self.links
         self._client = self._link.client
-        self._to_follow: Command | Welcome | None = None
+        self._to_follow: Command | None = None
         self._all_fly = bytes(self.layout.drones)  # orders
 
     def start(self, now: float) -> None:
-        """Say Hello. An agent that flies text sends no Welcome: assume one."""
+        """Say Hello. An agent that flies text sends no Welcome: begin without."""
         super().start(now)
         if self._client.by_text:
-            session = self._client.hello.session
-            self._to_follow = Welcome(session=session, nonce=0)
+            self._begin(self._client.hello.session)
 
     def receive(self, link: AgentLink, datagram: bytes, now: float) -> None:
         """Take a datagram. Raises `Refused`."""
         message = self._client.receive(datagram, now)
         if message is None or self.reason is not None:
             return
-        if isinstance(message, Command | Welcome):
+        if isinstance(message, Command):
             self._to_follow = message
+        elif isinstance(message, Welcome):
+            self._begin(message.first_seed)
         elif isinstance(message, Refuse):
             raise Refused(f"{link.name} refused: {message.reason}")
         elif isinstance(message, Close):
@@ -239,22 +239,22 @@ class OneAgent(WorldRules):
             self.reason = message.reason or "the agent closed"
 
     def step(self, now: float) -> bool:
-        """Follow the last message. False: no further call can move the world."""
-        message = self._to_follow
-        if message is None:
+        """Follow the last Command. False: no further call can move the world."""
+        command = self._to_follow
+        if command is None:
             return False
+        if command.orders.tobytes() == self._all_fly:
+            self.world.advance(command.actions, None, None, None)
+        else:
+            self.world.advance(command.actions, command.resets, command.seeds, command.frozen)
+        self.cause = command
         self._to_follow = None
         self._due.append(self._link)
-        if isinstance(message, Welcome):
-            self._reset_all(first_seeds(message.first_seed, self.layout.drones))
-            return False
-        if message.orders.tobytes() == self._all_fly:
-            self.world.advance(message.actions, None, None, None)
-        else:
-            self.world.advance(message.actions, message.resets, message.seeds, message.frozen)
-        self.cause = message
-        self.moved = True
         return False
+
+    def _begin(self, seed: int) -> None:
+        seeds = first_seeds(seed, self.layout.drones)
+        self._to_follow = reset_of_all(self.layout, seeds)
 
     def _lose_silent(self, link: AgentLink, why: str) -> None:
         raise PeerSilent(why)
@@ -273,7 +273,6 @@ class SeveralAgents(WorldRules):
     Attributes:
         episodes: Begun so far; a reset before anything was flown begins the same episode again.
         steps: Control steps of the running episode.
-        seed: Of the running episode; None: the streams of the episode before went on.
     """
 
     patience: float  # longest wait for a Command, s
@@ -281,7 +280,6 @@ class SeveralAgents(WorldRules):
     def __post_init__(self) -> None:
         super().__post_init__()
         self.episodes = self.steps = 0
-        self.seed: int | None = None
 
     # ---- episodes and steps
 
@@ -316,9 +314,8 @@ class SeveralAgents(WorldRules):
     def _begin(self) -> None:
         """Begin an episode for all that take part."""
         joining = self._who("flying", "waiting", "ready")
-        seeds = self._seeds(joining)
-        self.seed = None if seeds is None else int(seeds[0])
-        self._reset_all(seeds)
+        self.cause = reset = reset_of_all(self.layout, self._seeds(joining))
+        self.world.advance(reset.actions, reset.resets, reset.seeds, None)
         if self.steps or not self.episodes:
             self.episodes += 1
         self.steps = 0
@@ -349,11 +346,10 @@ class SeveralAgents(WorldRules):
             else:
                 staying.append(link)
                 actions[link.rows] = link.command.actions
-        self.world.advance(actions, None, None, None)
         self.steps += 1
         orders = np.full(layout.drones, FLY, np.uint8)
         self.cause = Command(session=0, sequence=self.steps, actions=actions, orders=orders)
-        self.moved = True
+        self.world.advance(actions, None, None, None)
         for link in staying:
             self._queue(link)
 

@@ -6,7 +6,6 @@ Welcome: a recorded Hello that is sent again takes none, and neither does a send
 read. Memory for simulators without a slot is bounded.
 """
 
-import secrets
 from collections import OrderedDict
 from collections.abc import Callable
 from contextlib import suppress
@@ -14,7 +13,7 @@ from typing import NamedTuple, TypeVar
 
 from . import binary, text
 from .auth import OVERHEAD, Key, is_sealed, key_id, message_of
-from .client import CLOSE_INTERVAL, CLOSE_LINGER, Address, critical_extension
+from .client import CLOSE_INTERVAL, CLOSE_LINGER, Address, address_text, mismatch, random_number
 from .errors import DecodeError, Forged, VersionMismatch
 from .fragments import Assembler, asks, is_fragment
 from .layout import Layout
@@ -70,7 +69,7 @@ class Server:
         *,
         slots: int = 1,
         key: Key | None = None,
-        draw_nonce: Callable[[], int] = lambda: secrets.randbits(64),
+        draw_nonce: Callable[[], int] = random_number,
     ) -> None:
         self.outbox = Outbox()
         self.statistics = self.outbox.statistics
@@ -156,21 +155,19 @@ class Server:
         seated = session if session and session.number == number and not session.is_text else None
         opening = None if seated else self.openings.get((arrival.address, number))
         holder = seated or opening
+        if holder is None and kind != binary.HELLO:
+            raise NoSuchSession
         if is_fragment(plain):
             if kind == binary.HELLO and not seated:
                 whole = self._assemble(plain, opening, arrival)
             elif kind == binary.STATE and holder:
                 whole = holder.assemble(plain, arrival.now)
-            elif kind == binary.STATE:
-                raise NoSuchSession
             else:
                 whole = None
                 self._drop("foreign", f"a fragment of type {kind}", arrival)
             if whole is None:
                 return None
             plain = whole
-        if holder is None and kind != binary.HELLO:
-            raise NoSuchSession
         message = binary.decode(plain, holder.layout if holder else None)
         if isinstance(message, Hello):
             self._receive_hello(message, arrival)
@@ -243,11 +240,11 @@ class Server:
         address = arrival.address
         place = address, hello.session
         if self._has(hello.session):
-            self._drop("stale", "", arrival)
+            self.statistics.counters["stale"] += 1
             return
         if place in self.openings and not self._closed:
             self.openings[place].repeat()
-            self._drop("duplicate", "", arrival)
+            self.statistics.counters["duplicate"] += 1
             return
         layout = self._fit(hello)
         if isinstance(layout, str):
@@ -266,19 +263,13 @@ class Server:
         """The layout of a simulator that is accepted, or the reason to refuse it."""
         if self._closed:
             return "the agent has closed"
-        low, high = hello.versions
-        if not low <= binary.VERSION <= high:
-            return f"expected protocol version {binary.VERSION}, got {low} to {high}"
-        unknown = critical_extension(hello)
-        if unknown is not None:
-            return f"expected no critical extension of type {unknown}"
-        return self._accept(hello)
+        return mismatch(hello, binary.VERSION, hello.extensions) or self._accept(hello)
 
     def _refuse(self, number: int, reason: str, arrival: _Arrival, key: Key | None) -> None:
         """Refuse a Hello, with no more bytes than those that came."""
         room = len(arrival.datagram) - _REASON_AT - (OVERHEAD if key else 0)
         if room >= 0:
-            refuse = Refuse(session=number, reason=_cut(reason, room))
+            refuse = Refuse(session=number, reason=one_line(reason, room))
             self.outbox.put([binary.encode(refuse)], arrival.address, key)
 
     def _assemble(
@@ -288,7 +279,7 @@ class Server:
         if opening:
             if asks(fragment):
                 opening.repeat()
-            self._drop("duplicate", "", arrival)
+            self.statistics.counters["duplicate"] += 1
             return None
         place = arrival.address, binary.peek(fragment)[1]
         assembler = self._assembling.get(place) or Assembler(binary.LONGEST_HELLO)
@@ -336,7 +327,7 @@ class Server:
                 del self.openings[address, number]
         layout = self._fit(opening.hello)  # another one may have come since its Hello
         if isinstance(layout, str):
-            reason = _cut(layout, len(plain) - _REASON_AT)
+            reason = one_line(layout, len(plain) - _REASON_AT)
             close = Close(session=opening.number, sequence=1, reason=reason)
             self.outbox.put([binary.encode(close)], peer, opening.session_key())
             opening.move("sent", Close)
@@ -436,7 +427,8 @@ class Server:
 
     def _drop(self, cause: str, reason: str, arrival: _Arrival) -> None:
         """Count a datagram that changes nothing."""
-        self.outbox.drop(cause, reason, arrival.address, arrival.now)
+        sentence = f"from {address_text(arrival.address)}: {reason}"
+        self.statistics.drop(cause, sentence, arrival.now)
 
 
 def _keep(table: OrderedDict[K, V], key: K, value: V, most: int = _MOST) -> None:
@@ -445,8 +437,3 @@ def _keep(table: OrderedDict[K, V], key: K, value: V, most: int = _MOST) -> None
     table.move_to_end(key)
     if len(table) > most:
         table.popitem(last=False)
-
-
-def _cut(reason: str, room: int) -> str:
-    """A reason that takes at most so many bytes."""
-    return one_line(reason).encode()[:room].decode(errors="ignore")

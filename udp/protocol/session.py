@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 from . import binary, text
 from .auth import Key, sealed
-from .client import Address, Tap, address_text, largest_datagram
+from .client import Address, Tap, largest_datagram
 from .errors import DecodeError
 from .fragments import Assembler, Transfer, asks
 from .layout import Array, Layout
@@ -45,10 +45,6 @@ class Outbox:
         """Take the datagrams of a message, sealed where there is a key."""
         self.datagrams += [(datagram, address) for datagram in sealed(datagrams, key)]
         self.statistics.counters[count] += 1
-
-    def drop(self, cause: str, reason: str, address: Address, now: float) -> None:
-        """Count a datagram that changes nothing."""
-        self.statistics.drop(cause, f"from {address_text(address)}: {reason}", now)
 
 
 @dataclass(eq=False)
@@ -196,17 +192,18 @@ class Session:
         Raises `NoSuchSession` for a State beyond the next one: the simulator went on with another
         agent, and what opened the session here came late, from before a restart.
         """
+        counters = self.outbox.statistics.counters
         is_state = isinstance(message, State)
         number = getattr(message, "sequence", 0)
         if is_state and number == self.sequence:
             self._answer_again()
-            self._drop("duplicate", now)
+            counters["duplicate"] += 1
             return None
         if is_state and number > self.sequence + 1 and not self.is_text:
             raise NoSuchSession
         is_due = number == self.sequence + is_state or isinstance(message, Close)
         if not is_due or ("received", type(message)) not in AGENT[self.state]:
-            self._drop("stale", now)
+            counters["stale"] += 1
             return None
         if isinstance(message, State):
             return self.take_state(message, plain, now)
@@ -222,7 +219,7 @@ class Session:
         elif isinstance(message, Missing) and message.kind == binary.COMMAND:
             self.outbox.put(self.reply.resend(message), self.peer, self.key, "resent")
         else:
-            self._drop("stale", now)
+            counters["stale"] += 1
         return None
 
     def assemble(self, fragment: bytes, now: float) -> bytes | None:
@@ -234,13 +231,10 @@ class Session:
             is_repeat = sequence == self.sequence and self.slot >= 0
             if is_repeat and asks(fragment):
                 self._answer_again()
-            self._drop("duplicate" if is_repeat else "stale", now)
+            self.outbox.statistics.counters["duplicate" if is_repeat else "stale"] += 1
             return None
         self.heard_at = now
         whole = self._assembler.take(fragment)
         if whole is None and (answer := self._assembler.ask(fragment)):
             self.outbox.put(answer, self.peer, self.session_key())
         return whole
-
-    def _drop(self, cause: str, now: float) -> None:
-        self.outbox.drop(cause, "", self.peer, now)

@@ -11,8 +11,6 @@ WARNING_INTERVAL = 10.0  # shortest time between two warnings of the same cause,
 
 _log = logging.getLogger("rotorgram.udp")
 _REMEMBERED = 1 << 14
-_QUIET = frozenset({"duplicate", "stale"})
-"""Events of every network that loses datagrams: counted, without a warning."""
 
 
 class Statistics:
@@ -21,7 +19,8 @@ class Statistics:
     def __init__(self) -> None:
         self.counters: Counter[str] = Counter()
         """`sent`, `received`, `resent`, `unsent`, `sessions`, and what was dropped, by cause:
-        `malformed`, `forged`, `foreign`, `refused`, `duplicate`, `stale`."""
+        `malformed`, `forged`, `foreign`, `refused`, and without a warning, for every network that
+        loses datagrams has them, `duplicate` and `stale`."""
         self.round_trips: deque[float] = deque(maxlen=_REMEMBERED)
         """The last ones, s: from the first sending of a message to the answer that counts."""
         self.last_error = ""  # why the last unexpected datagram was dropped; "" if none was
@@ -30,8 +29,6 @@ class Statistics:
     def drop(self, cause: str, reason: str, now: float) -> None:
         """Count a datagram that changes nothing; warn if it is time to."""
         self.counters[cause] += 1
-        if cause in _QUIET:
-            return
         self.last_error = one_line(f"{cause} {reason}")
         if now >= self._next_warning.get(cause, now):
             warn(f"dropped a datagram: {self.last_error}")

@@ -77,21 +77,16 @@ def _converted(telemetry: Iterable[Array], layout: Layout, *, to_paper: bool) ->
     return converted
 
 
-def _rates_in_paper_frame(rates: Array) -> Array:
-    """The paper's axes are left-handed: rotations about them have the other sign."""
-    return 0.0 - positions_in_paper_frame(rates)
-
-
-def _rates_in_body_frame(rates: Array) -> Array:
-    return 0.0 - positions_in_world_frame(rates)
-
-
 _Conversion = Callable[[Array], Array]
 
 _CONVERSIONS: Final[dict[tuple[tuple[int, ...], str], tuple[_Conversion, _Conversion]]] = {
     ((3,), "world"): (positions_in_paper_frame, positions_in_world_frame),
     ((4,), "body to world"): (attitudes_in_paper_frame, quaternions_in_world_frame),
-    ((3,), "body"): (_rates_in_paper_frame, _rates_in_body_frame),
+    # The paper's axes are left-handed: rotations about them have the other sign.
+    ((3,), "body"): (
+        lambda rates: 0.0 - positions_in_paper_frame(rates),
+        lambda rates: 0.0 - positions_in_world_frame(rates),
+    ),
 }
 """Telemetry by shape and frame: into the paper's frame, and back. Other telemetry stays as it is.
 """

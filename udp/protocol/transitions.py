@@ -3,10 +3,9 @@
 One table for each side says what a message does, sent or received.
 """
 
-import tomllib
-from pathlib import Path
 from typing import Final, Literal, TypeVar
 
+from ...models.files import read_own_toml
 from . import messages
 from .messages import Message
 
@@ -21,9 +20,8 @@ S = TypeVar("S")
 
 
 def _read(side: str) -> dict[S, dict[Move, S]]:
-    text = Path(__file__).with_name("transitions.toml").read_text("utf-8")
     table: dict[S, dict[Move, S]] = {}
-    for state, ways in tomllib.loads(text)[side].items():
+    for state, ways in read_own_toml(__file__, "transitions")[side].items():
         table[state] = {}
         for way, following in ways.items():
             for name, after in following.items():

@@ -1,6 +1,5 @@
 """The agent's port, and the simulators that have a slot at it."""
 
-import logging
 import os
 import time
 import weakref
@@ -27,12 +26,11 @@ from ..protocol.layout import Array, Layout
 from ..protocol.messages import Close, Hello, State
 from ..protocol.server import Server
 from ..protocol.session import Event
+from ..protocol.statistics import warn
 from .sockets import LONGEST_WAIT, PAUSE, Port
 
 if TYPE_CHECKING:
     from ..journal import Journal
-
-_log = logging.getLogger("rotorgram.udp")
 
 Order = tuple[Array, Array, Array | None]
 """Actions, orders and seeds of the drones of one simulator: see `messages.Command`."""
@@ -93,8 +91,7 @@ class AgentConfig:
         if self.env_id is not None and env_id != self.env_id:
             return f"expected a simulator of {self.env_id}, got one of {env_id}"
         if self.drones is not None and drones != self.drones:
-            wanted = "one drone" if self.drones == 1 else f"{self.drones} drones"
-            return f"expected a simulator of {wanted}, got one of {drones}"
+            return f"drones: expected {self.drones} of a simulator, got {drones}"
         if self.vehicle_hash is not None and spec.vehicle_hash != self.vehicle_hash:
             return (
                 f"expected a vehicle of hash {self.vehicle_hash}, "
@@ -320,7 +317,7 @@ class Agent:
         self._keep_sockets()
         if self.server.slots[slot] is None:
             reason += f"; waiting for another at {address_text(self.address)}"
-        _log.warning("%s", reason)
+        warn(reason)
 
 
 def _spec_difference(ours: EnvSpec, theirs: EnvSpec) -> str:
@@ -346,7 +343,7 @@ def _leave(pid: int, server: Server, port: Port, journal: "Journal | None") -> N
     while (timer := server.next_timer()) is not None:
         left = max(timer - time.monotonic(), 0.0)
         with suppress(OSError):  # nothing came
-            datagram, address = port.receive(left, strangers=False)
+            datagram, address = port.receive(left)
             server.receive(datagram, address, time.monotonic())
         server.handle_timer(time.monotonic())
         _flush(server, port)

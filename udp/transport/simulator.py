@@ -1,11 +1,11 @@
 """The simulator: a UDP client that steps envs by the Commands of one agent, or of several."""
 
+import json
 import threading
 import time
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack, suppress
 from dataclasses import replace
-from functools import partial
 from math import inf
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
@@ -19,7 +19,7 @@ from ...models.fields import Choice, Limits, check
 from ..layouts import layout_of
 from ..protocol import binary
 from ..protocol.auth import Key, read_key
-from ..protocol.client import Address, Client, LinkConfig, largest_datagram, new_session
+from ..protocol.client import Address, Client, LinkConfig, largest_datagram, random_number
 from ..protocol.errors import LinkError
 from ..protocol.messages import Command, Hello
 from ..protocol.party import (
@@ -39,9 +39,8 @@ DEFAULT_AGENT = ("127.0.0.1", 8001)
 DEFAULT_SIMULATOR = ("127.0.0.1", 8000)
 _ALIVE_EVERY = 0.5  # period of the message Alive while an agent waits for a State, s
 
-Observer = Callable[[Command | None], None]
-"""Called with the Command that moved the drones, or None where all of them were reset, once the
-world has moved: see `Simulator.observer`."""
+Observer = Callable[[Command], None]
+"""Called with the Command that moved the drones: see `Simulator.observer`."""
 
 
 class Simulator(NotCopied):
@@ -121,26 +120,23 @@ class Simulator(NotCopied):
             links = _links(
                 spec, worlds, servers, times, insecure=insecure, by_text=by_text, key=key
             )
-            addresses = [link.address for link in links]
-            if len(set(addresses)) < len(addresses):
-                raise InputError(f"agents: expected a different address of each, got {addresses}")
-            self._port = port = Port(bind, insecure=insecure, peers=addresses)
+            self._by_address = {link.address: link for link in links}
+            if len(self._by_address) < len(links):
+                raise InputError(f"agents: expected a different address of each, got {servers}")
+            self._port = port = Port(bind, insecure=insecure, peers=tuple(self._by_address))
             failing.callback(port.close)
-            self._receive = partial(port.receive, strangers=False)
             self.address: Address = port.address
-            if self.address in addresses:
+            if self.address in self._by_address:
                 raise InputError(
                     f"server: expected the address of an agent, got that of this side, {bind}"
                 )
-            self.rules: Rules
             period = spec.control_period
             if agents is None:
-                self.rules = OneAgent(stepped, layout, period, links)
+                self.rules: Rules = OneAgent(stepped, layout, period, links)
             elif isinstance(stepped, GymnasiumWorld):
                 raise InputError(f"env: expected a registered task for several drones, got {env!r}")
             else:
                 self.rules = SeveralAgents(stepped, layout, period, links, patience)
-            self._by_address = {link.address: link for link in links}
             if record:
                 self._record(record)
             failing.pop_all()
@@ -209,10 +205,10 @@ class Simulator(NotCopied):
                 raise LinkError(f"{NO_RESET} ({error})") from None
             rules.answer(time.monotonic())
             self._flush()
-            if rules.moved:
-                rules.moved = False
+            if cause := rules.cause:
+                rules.cause = None
                 if self.observer is not None:
-                    self.observer(rules.cause)
+                    self.observer(cause)
                 if self._journal:
                     self._journal.write()
             if rules.reason is not None:
@@ -225,7 +221,7 @@ class Simulator(NotCopied):
                 rules.handle_timers(before)
                 continue
             try:
-                datagram, address = self._receive(left)
+                datagram, address = self._port.receive(left)
             except OSError as error:
                 if self._port.closed:
                     raise
@@ -251,7 +247,7 @@ class Simulator(NotCopied):
                 break
             left = timer - time.monotonic()
             with suppress(OSError):  # nothing came, or an earlier datagram found nobody
-                datagram, address = self._receive(max(left, 0.0))
+                datagram, address = self._port.receive(max(left, 0.0))
                 if link := self._by_address.get(address):
                     link.client.receive(datagram, time.monotonic())
             for each in rules.links:
@@ -283,11 +279,13 @@ class Simulator(NotCopied):
 
     def _record(self, path: Path | str) -> None:
         from ..journal import Journal
-        from ..journal.writer import about_of
 
         link = self.link
         codec = "text" if link.by_text else "binary"
-        self._journal = Journal(path, side="simulator", codec=codec, about=about_of(self.stepped))
+        about = {}
+        if config := getattr(self.stepped, "config", None):  # a `Loop` has one
+            about = {"config": json.dumps(config.to_dict()), "backend": config.backend.name}
+        self._journal = Journal(path, side="simulator", codec=codec, about=about)
         link.tap = self._journal.tap
         if link.by_text:  # says no Hello
             link.tap(0, link.hello, binary.encode(link.hello))
@@ -319,7 +317,7 @@ def _links(
         rows = slice(number * share, (number + 1) * share)
         own = replace(spec, agents=spec.agents[rows])
         client = Client(
-            Hello(session=new_session(), spec=own.to_json(), worlds=worlds),
+            Hello(session=random_number(), spec=own.to_json(), worlds=worlds),
             layout_of(own, worlds),
             config,
             largest=largest_datagram(there),

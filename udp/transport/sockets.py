@@ -58,13 +58,11 @@ def resolve(address: Address, *, insecure: bool, way_out: str = WAY_OUT) -> Addr
     Raises:
         InputError: It is not an address, or not a loopback one and `insecure` is not set.
     """
-    try:
-        host, port = address
-        valid = isinstance(host, str) and type(port) is int and 0 <= port <= 65535
-    except (TypeError, ValueError):
-        valid = False
-    if not valid:
-        raise InputError(f"address: expected (host, port from 0 to 65535), got {address!r}")
+    match address:
+        case (str(host), int(port)) if 0 <= port <= 65535:
+            pass
+        case _:
+            raise InputError(f"address: expected (host, port from 0 to 65535), got {address!r}")
     try:
         found = socket.getaddrinfo(host, port, socket.AF_INET, socket.SOCK_DGRAM)
     except (socket.gaierror, UnicodeError):
@@ -175,17 +173,18 @@ class Port:
 
     def keep(self, peers: Collection[Address]) -> None:
         """Have a socket for each of these, and no others."""
-        for peer in self._own.keys() - set(peers):
+        wanted = set(peers)
+        for peer in self._own.keys() - wanted:
             sock = self._own.pop(peer)
             for selector in self._selectors:
                 selector.unregister(sock)
             sock.close()
         if sys.platform == "linux":  # others sort the datagrams of one port by other rules
-            for peer in set(peers) - self._own.keys():
+            for peer in wanted - self._own.keys():
                 self._add(peer)
-        self._missing = len(self._own) < len(set(peers))
+        self._missing = len(self._own) < len(wanted)
 
-    def receive(self, timeout: float, *, strangers: bool) -> tuple[bytes, Address]:
+    def receive(self, timeout: float, *, strangers: bool = False) -> tuple[bytes, Address]:
         """The next datagram and where it came from.
 
         Args:
