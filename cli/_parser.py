@@ -46,7 +46,7 @@ def parse(kind: type[Command], prog: str, words: Sequence[str]) -> Command:
     if isinstance(command, ModuleFlag) and command.env:
         from ..envs import registry
 
-        registry.load(command.env)
+        registry.task_type(registry.load(command.env))
     check_fields(command)
     return command
 
