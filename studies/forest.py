@@ -8,9 +8,10 @@
 A training is `rotorgram train ppo --env rotorgram/Forest-v0` with its tuned preset, motor lag, the
 noise of the depth camera, 1 tree per 8 m², and a speed from 2.5 to 5.5 m/s drawn for each episode;
 the clock runs from before its process starts to its end. Each policy then flies `--flights` unseen
-layouts at 3 and at 5 m/s, with 1 tree per 10 m² and per 8 m². Beside it `straight` flies at the
-goal and looks at nothing, and `vfh` (VFH+) steers by a level lidar of 360 rays at 10 Hz. Intervals
-are Wilson's, at 95 %, of all flights of a row.
+layouts at 3 and at 5 m/s, with 1 tree per 10 m² and per 8 m². In the layouts of all policies
+`straight` flies at the goal and looks at nothing, and `vfh` (VFH+) steers by a level lidar of 360
+rays at 10 Hz. Intervals are Wilson's, at 95 %, of all flights of a row. Traversability is that of
+`--hard` layouts of the first policy.
 
 It takes about 40 minutes on two cores. Other settings than the preset's are given by `--set`, as
 to `rotorgram train`; `straight` and `vfh` do not fly beside them.
@@ -22,9 +23,9 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from measuring import RESULTS, options, write
@@ -32,27 +33,33 @@ from rotorgram.agents import find_controller, load
 from rotorgram.envs import LocalVectorEnv
 from rotorgram.envs.config import EnvConfig
 from rotorgram.envs.spec import EnvSpec
-from rotorgram.flights.trajectories import evaluation_seed, fly_episodes
+from rotorgram.flights.trajectories import (
+    Flights,
+    evaluation_seed,
+    fly_episodes,
+    mean_traversability,
+)
 from rotorgram.training.statistics import share_interval
 
 WORDS = ("ppo", "--env", "rotorgram/Forest-v0", "--effects", "motor_lag", "--env.density", "0.125",
          "--env.speed", "2.5", "5.5")  # fmt: skip
 CASES = [(density, speed) for density in (0.1, 0.125) for speed in (3.0, 5.0)]
+Flown = tuple[dict[str, Any], Flights]
 MEANS = ("mean_speed", "top_speed", "least_clearance", "flight_time")
 
 
 class Straight:
-    """Flies at the goal."""
+    """Flies at the goal, for all drones of a batch."""
+
+    options: ClassVar[dict[str, object]] = {}
 
     def __init__(self, spec: EnvSpec) -> None:
         self._scale = spec.action_scale
 
-    def reset(self) -> None:
-        """Nothing of an episode is kept."""
-
-    def act(self, observation: Any) -> np.ndarray:
-        x, y, height, *_ = observation["observation"].tolist()
-        wanted = np.array((x, y, height, 0.0))
+    def actions(self, observations: Any) -> np.ndarray:
+        """Of the level `velocity`."""
+        x, y, height, *_ = observations["observation"].T
+        wanted = np.stack((x, y, height, 0.0 * x), axis=-1)
         return np.clip(wanted / self._scale, -1.0, 1.0).astype(np.float32)
 
 
@@ -73,29 +80,33 @@ def woods(flights: int, density: float, speed: float, **more: Any) -> LocalVecto
     return LocalVectorEnv(config, flights, autoreset_mode="Disabled")
 
 
-def fly(policy: Any, flights: int, density: float, speed: float, seed: int) -> dict[str, Any]:
-    """Of flights in unseen layouts: how many arrive, touch, or neither, and means."""
+def fly(policy: Any, flights: int, density: float, speed: float, seed: int) -> Flown:
+    """Flights of a policy in unseen layouts, and their trajectories."""
     env = woods(flights, density, speed)
-    pilot = policy(env.env_spec)
-    flown = fly_episodes(env, pilot, flights, "final", training_seed=seed)
+    flown = fly_episodes(env, policy(env.env_spec), flights, "final", training_seed=seed)
     env.close()
-    return counted(env, np.array([one.telemetry["metrics"][-1] for one in flown]))
+    return counted(env, np.array([one.telemetry["metrics"][-1] for one in flown])), flown
 
 
-def fly_vfh(flights: int, density: float, speed: float) -> dict[str, Any]:
-    """The same of VFH+, all drones at once, in the layouts of `straight`."""
-    vfh: Any = find_controller("examples/vfh.py:Vfh")
-    env = woods(flights, density, speed, **vfh.options)
-    pilot = vfh(env.env_spec)
-    env.reset(seed=[evaluation_seed(number, "final", 0) for number in range(flights)])
-    nobody = done = np.zeros(flights, bool)
-    last = env.telemetry["metrics"]
-    while not done.all():
-        env.advance(pilot.actions(env.observations), nobody, None, done)
-        last = np.where(done[:, None], last, env.telemetry["metrics"])
-        done = done | env.terminated | env.truncated
+def fly_batch(
+    kind: Any, flights: int, density: float, speed: float, seeds: Iterable[int]
+) -> dict[str, Any]:
+    """The same of a controller, all drones at once, in the layouts of all policies."""
+    env = woods(flights, density, speed, **kind.options)
+    nobody = np.zeros(flights, bool)
+    ends = []
+    for seed in seeds:
+        pilot = kind(env.env_spec)
+        env.reset(seed=[evaluation_seed(number, "final", seed) for number in range(flights)])
+        done = nobody
+        last = env.telemetry["metrics"]
+        while not done.all():
+            env.advance(pilot.actions(env.observations), nobody, None, done)
+            last = np.where(done[:, None], last, env.telemetry["metrics"])
+            done = done | env.terminated | env.truncated
+        ends.append(last)
     env.close()
-    return counted(env, last)
+    return counted(env, np.concatenate(ends))
 
 
 def counted(env: LocalVectorEnv, last: np.ndarray) -> dict[str, Any]:
@@ -114,35 +125,47 @@ def counted(env: LocalVectorEnv, last: np.ndarray) -> dict[str, Any]:
 
 def main() -> None:
     args = options(
-        __doc__, seeds=5, first_seed=4100, flights=1000, vfh=False, set=[""],
+        __doc__, seeds=5, first_seed=4100, flights=1000, hard=30, vfh=False, set=[""],
         out=RESULTS / "forest.json",
     ).parse_args()  # fmt: skip
-    changes = [change for change in args.set if change]
-    beside: list[dict[str, Any]] = [{} for _ in CASES]
-    if not changes:
-        for case, row in zip(CASES, beside, strict=True):
-            row["vfh"] = fly_vfh(args.flights, *case)
+    numbers = range(args.first_seed, args.first_seed + args.seeds)
+    vfh: Any = find_controller("examples/vfh.py:Vfh")
     if args.vfh:
         content = json.loads(args.out.read_text())
-        for case, row in zip(content["cases"], beside, strict=True):
-            case |= row
+        for row, case in zip(content["cases"], CASES, strict=True):
+            row["vfh"] = fly_batch(vfh, args.flights, *case, numbers)
         write(args.out, content)
         return
-    if not changes:
-        for case, row in zip(CASES, beside, strict=True):
-            row["straight"] = fly(Straight, args.flights, *case, seed=0)
+    changes = [change for change in args.set if change]
     words = [*WORDS, *(["--set", *changes] if changes else [])]
+    beside: list[dict[str, Any]] = [{} for _ in CASES]
     seeds: list[dict[str, Any]] = []
-    for seed in range(args.first_seed, args.first_seed + args.seeds):
+    for seed in numbers:
         with tempfile.TemporaryDirectory() as folder:
             seconds = train(words, seed, Path(folder) / "run")
             kept = load(Path(folder) / "run" / "checkpoint.safetensors")
-        rows = [fly(kept.policy, args.flights, *case, seed=seed) for case in CASES]
+        rows = []
+        for case, others in zip(CASES, beside, strict=True):
+            row, flown = fly(kept.policy, args.flights, *case, seed=seed)
+            rows.append(row)
+            if not seeds:
+                others["traversability"] = round(mean_traversability(flown[: args.hard]), 2)
         seeds.append({"seed": seed, "seconds": seconds, "cases": rows})
         print(seed, seconds, [row["arrived"] for row in rows], flush=True)
-        cases = [summary(seeds, number) | row for number, row in enumerate(beside)]
-        command = f"rotorgram train {shlex.join(words)}"
-        write(args.out, {"command": command, "cases": cases, "seeds": seeds})
+        _write(args.out, words, seeds, beside)
+    if not changes:
+        for case, others in zip(CASES, beside, strict=True):
+            others["straight"] = fly_batch(Straight, args.flights, *case, numbers)
+            others["vfh"] = fly_batch(vfh, args.flights, *case, numbers)
+        _write(args.out, words, seeds, beside)
+
+
+def _write(
+    out: Path, words: list[str], seeds: list[dict[str, Any]], beside: list[dict[str, Any]]
+) -> None:
+    cases = [summary(seeds, number) | row for number, row in enumerate(beside)]
+    command = f"rotorgram train {shlex.join(words)}"
+    write(out, {"command": command, "cases": cases, "seeds": seeds})
 
 
 def summary(seeds: list[dict[str, Any]], number: int) -> dict[str, Any]:
