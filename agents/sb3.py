@@ -30,7 +30,7 @@ try:
     )
 except ModuleNotFoundError:
     for _package in ("torch", "stable_baselines3"):
-        require(_package, "train", "sb3-a2c")
+        require(_package, "train", "Stable-Baselines3")
     raise
 
 Settings = dict[str, object]

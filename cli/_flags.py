@@ -192,6 +192,8 @@ def parse_value(text: str) -> object:
 def parse_address(text: str) -> tuple[str, int]:
     """HOST:PORT as a pair. Raises `InputError`."""
     parts = re.fullmatch(r"(.+):([0-9]{1,5})", text)
-    if not parts:
-        raise InputError(f"address: expected HOST:PORT, got {shortened(text)}")
+    if not parts or int(parts[2]) > 65535:
+        raise InputError(
+            f"address: expected HOST:PORT with a port up to 65535, got {shortened(text)}"
+        )
     return parts[1], int(parts[2])

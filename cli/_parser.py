@@ -169,5 +169,7 @@ def _flags(words: Sequence[str]) -> dict[str, str]:
         if word.startswith("--"):
             flag, equals, value = word.removeprefix("--").partition("=")
             prefix, dot, name = flag.replace("-", "_").rpartition(".")
-            flags[prefix + dot + name.removeprefix("no_")] = value if equals else following
+            if not equals and not following.startswith("--"):
+                value = following
+            flags[prefix + dot + name.removeprefix("no_")] = value
     return flags

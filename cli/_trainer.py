@@ -43,7 +43,9 @@ _UPDATE_WITHIN = 2.0  # s
 
 def begin(command: "Train") -> int:
     """A new training; the exit status."""
-    require("safetensors", "train", "writing checkpoints")  # before it trains
+    # Packages that are missing are named before it trains, or waits.
+    require("safetensors", "train", "writing checkpoints")
+    _ = find_algorithm(command.algorithm).agent
     task = command.preset_of or command.env_id
     base = find_preset(command.algorithm, command.preset, task)
     if not base.fits:
@@ -99,7 +101,8 @@ def resume(command: "Train", folder: Path) -> int:
             print(f"checkpoint: {folder / CHECKPOINT}")
             return 0
         for name, (then, now) in other_versions(kept.versions).items():
-            print(f"note: {name} was {then} and is {now}: the numbers may differ")
+            if name in kept.versions:
+                print(f"note: {name} was {then} and is {now}: the numbers may differ")
         backend = kept.env.backend if kept.env else kept.backend
         with _opened(fitted(command, kept), kept.num_envs, backend) as env:
             return _train(command, Training.resume(kept, env), folder)

@@ -435,8 +435,8 @@ def obstacle_of(model: MjModel, data: MjData, geom: int) -> Obstacle:
         thin, wide, long = size = size[order]
         kind = "box"
         if thin >= wide / 2:
-            kind = "capsule"
-            size = (wide, max(long - wide, _SIZE.low))
+            kind = "capsule" if long - wide >= _SIZE.low else "sphere"
+            size = (wide, long - wide)
     elif kind not in kernels.KINDS:
         expected = ", ".join(kernels.KINDS)
         raise InputError(f"scene: expected {expected} or ellipsoid, got {name}, a {kind}")

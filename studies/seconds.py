@@ -60,7 +60,7 @@ def evaluate(agent: Any, env_id: str, args: Any, seed: int) -> dict[str, object]
     return, means over episodes; crashes; the verdict. The starts are those of the training's seed.
     """
     episodes = args.episodes
-    options = find_controller(agent).options if isinstance(agent, str) else agent.options
+    options = find_controller(agent).options if isinstance(agent, str) else agent.spec.options
     keywords = {**options, "vehicle": args.vehicle, "backend": args.backend}
     if args.scene:
         keywords["scene"] = args.scene

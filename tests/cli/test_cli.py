@@ -532,7 +532,7 @@ def test_nothing_that_a_checkpoint_names_is_imported(
         store(named, folder / "checkpoint.safetensors")
         assert run(capsys, "evaluate", folder, "--episodes", 1)[0] == (not known)
         assert run(capsys, "train", "a2c", "--resume", folder)[0] == (not known)
-    config = EnvConfig.from_keywords(name, **named.options)
+    config = EnvConfig.from_keywords(name, **named.spec.options)
     (trajectory,) = flown_trajectories(named.policy(), config, [0])  # as `render`
     assert trajectory.spec.env_id == "rotorgram/Elevation-v0"
     assert not imported.exists()

@@ -85,7 +85,7 @@ def test_what_crosses_the_wire_needs_numpy_alone(where: str) -> None:
     names = imported(where)
     inside = "rotorgram." + where.replace("/", ".").removesuffix(".py")
     ours = {name for name in names if name.startswith("rotorgram") and inside not in name}
-    light = {f"rotorgram.models.{name}" for name in ("errors", "fields", "frames")}
+    light = {f"rotorgram.models.{name}" for name in ("errors", "fields", "files", "frames")}
     light.add("rotorgram.scenes")
     assert {"rotorgram.models.errors"} <= ours <= light
     assert others(names) == {"numpy"}

@@ -375,7 +375,7 @@ def test_text_needs_an_env_that_is_known_here() -> None:
 def test_a_world_of_two_drones_is_more_than_one_drone() -> None:
     two = replace(env_spec(EnvConfig(env_id=ENV_ID)), agents=("first", "second"))
     hello = Hello(session=1, spec=two.to_json())
-    assert AgentConfig(drones=1).accept(hello) == "drones: expected 1 of a simulator, got 2"
+    assert AgentConfig(drones=1).accept(hello) == "drones: expected a simulator of 1, got one of 2"
     layout = AgentConfig(drones=2).accept(hello)
     assert not isinstance(layout, str)
     assert layout.drones == 2

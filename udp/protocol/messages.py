@@ -27,8 +27,8 @@ _CONTROL = re.compile(r"[\x00-\x1f\x7f-\x9f]")
 
 
 def one_line(text: str, most: int = MAX_TEXT) -> str:
-    """Any text made fit for a message: no control characters, at most `MAX_TEXT` bytes, or fewer
-    if they are told.
+    """Any text made fit for a message: no control characters, at most `most` bytes, and never more
+    than `MAX_TEXT`.
     """
     raw = _CONTROL.sub(" ", text).encode(errors="replace")
     return raw[: min(most, MAX_TEXT)].decode(errors="ignore")

@@ -91,7 +91,7 @@ class AgentConfig:
         if self.env_id is not None and env_id != self.env_id:
             return f"expected a simulator of {self.env_id}, got one of {env_id}"
         if self.drones is not None and drones != self.drones:
-            return f"drones: expected {self.drones} of a simulator, got {drones}"
+            return f"drones: expected a simulator of {self.drones}, got one of {drones}"
         if self.vehicle_hash is not None and spec.vehicle_hash != self.vehicle_hash:
             return (
                 f"expected a vehicle of hash {self.vehicle_hash}, "

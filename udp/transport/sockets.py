@@ -59,7 +59,7 @@ def resolve(address: Address, *, insecure: bool, way_out: str = WAY_OUT) -> Addr
         InputError: It is not an address, or not a loopback one and `insecure` is not set.
     """
     match address:
-        case (str(host), int(port)) if 0 <= port <= 65535:
+        case (str(host), int(port)) if type(port) is int and 0 <= port <= 65535:
             pass
         case _:
             raise InputError(f"address: expected (host, port from 0 to 65535), got {address!r}")
