@@ -25,6 +25,10 @@ ENV = "rotorgram/Hover-v0"
 SWARM = "rotorgram/Formation-v0"
 FOREST = "rotorgram/Forest-v0"
 STEPS = 20
+COMMITS = {"CleanRL": "004f8a0"}  # of projects whose scripts are copied, not installed
+CLEANRL = (
+    "`ppo_atari_lstm.py` on `Forest-v0`: its loop is ours after it, `studies/recurrent_ppo.py`"
+)
 HEAD = """# With other libraries
 
 `make test-libraries` flies these envs in an environment of its own, and writes this page.
@@ -43,7 +47,7 @@ class Case(NamedTuple):
     """A way to fly."""
 
     package: str
-    """Name of the distribution."""
+    """Name of the distribution, or of a project without one."""
     what: str
     fly: Callable[[], None]
 
@@ -106,6 +110,14 @@ def recurrent() -> None:
     RecurrentPPO("MultiInputLstmPolicy", env, n_steps=32, batch_size=32, n_epochs=1).learn(64)
 
 
+def cleanrl() -> None:
+    """CleanRL's recurrent PPO, whose script is no package: the loop is ours after it."""
+    from recurrent_ppo import learn
+
+    env = gym.make_vec(FOREST, num_envs=4, autoreset_mode="SameStep")
+    learn(env, steps=16, updates=1)
+
+
 def skrl(vector: bool) -> None:
     """wrap_env recognises an env by its classes."""
     import torch
@@ -163,6 +175,7 @@ CASES = (
     Case("stable_baselines3", "`MultiInputPolicy` on `Forest-v0`", multi_input),
     Case("stable_baselines3", "`CnnPolicy` on pictures of `Forest-v0`", convolutions),
     Case("sb3-contrib", "`RecurrentPPO` on `Forest-v0`", recurrent),
+    Case("CleanRL", CLEANRL, cleanrl),
     Case("skrl", "`wrap_env`", lambda: skrl(vector=False)),
     Case("skrl", "`wrap_env` on a vector env", lambda: skrl(vector=True)),
     Case("SuperSuit", "`concat_vec_envs_v1` and SB3's PPO on a swarm", supersuit),
@@ -184,7 +197,8 @@ def main(page: Path) -> int:
         except Exception as error:
             result = f"fails: {type(error).__name__}: {str(error).splitlines()[0][:120]}"
             failed += 1
-        row = f"| {case.package} | {version(case.package)} | {case.what} | {result} |"
+        release = COMMITS.get(case.package) or version(case.package)
+        row = f"| {case.package} | {release} | {case.what} | {result} |"
         print(row, flush=True)
         rows.append(row)
     page.write_text(HEAD + "\n".join(rows) + "\n", encoding="utf-8")

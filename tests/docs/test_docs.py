@@ -181,6 +181,27 @@ def test_the_page_of_solids_tells_what_was_measured() -> None:
     check("solids", rays, f"all but {errors['off']} are within 0.2 mm", *rows)
 
 
+def test_the_page_of_tasks_tells_how_policies_failed() -> None:
+    policies = result("failures")["policies"]
+    assert [one["policy"] for one in policies] == ["mlp", "gru", "cnn"]
+    rows = []
+    for cause, row in (
+        ("evaded another trunk", 2),
+        ("turned back", 3),
+        ("slow among trunks", 4),
+        ("kept its course", 1),
+    ):
+        counts = [sum(f["cause"] == cause for f in one["failures"]) for one in policies]
+        rows.append((*counts, row))
+    rows.append((*(one["flights"] for one in policies), "–"))
+    for held in ("touched", "pixels_before"):
+        rows.append((*(sum(f[held] > 0 for f in one["failures"]) for one in policies), "–"))
+    slow = (f"{one['passes_slow']} of {one['passes']}" for one in policies)
+    rows.append((*slow, "–"))
+    check("tasks", *(f"| {' | '.join(map(str, row))} |" for row in rows))
+    assert all("/trunk" in f["solid"] for one in policies for f in one["failures"])
+
+
 def test_the_scaling_page_tells_what_was_measured() -> None:
     scaling = result("performance/scaling")
     extrapolated = scaling["extrapolated"]
