@@ -302,3 +302,99 @@ def test_the_page_of_rigid_tells_what_was_measured() -> None:
         check("rigid", f"| {int(drones):,} | {' | '.join(numbers)} |")
     ratio = result("rigid/a2c")["ratio_to_sb3"]["a2c"]
     check("rigid", f"{ratio:.2f} times as many env steps per second")
+
+
+def percent(share: float) -> str:
+    return f"{100 * share:.1f}"
+
+
+def test_the_table_of_forests_has_what_was_flown() -> None:
+    found = result("forest")
+    assert len(found["cases"]) == 4
+    assert len(found["seeds"]) == 5
+    rows = []
+    for case in found["cases"]:
+        others = [case[name] for name in ("vfh", "straight")]
+        low, high = percent(case["low"]), percent(case["high"])
+        cells = [
+            f"{1 / case['density']:.0f} m²",
+            f"{case['speed']:.0f} m/s",
+            f"{percent(case['share'])} % ({low} to {high})",
+            f"{case['mean_speed']:.2f} m/s",
+            f"{case['top_speed']:.2f} m/s",
+            *(f"{percent(one['arrived'] / one['flights'])} %" for one in others),
+        ]
+        rows.append(f"| {' | '.join(cells)} |")
+    minutes = [one["seconds"] / 60 for one in found["seeds"]]
+    check("tasks", *rows, f"in {min(minutes):.1f} to {max(minutes):.1f} minutes from process start")
+
+
+def test_the_page_of_tasks_tells_what_else_was_measured_in_forests() -> None:
+    cases = result("forest")["cases"]
+    easy, dense = cases[:2], cases[2:]
+    for case in (easy[1], dense[1]):
+        beside = case["vfh"]
+        assert beside["arrived"] / beside["flights"] < case["low"]  # as the page says
+    straight = easy[0]["straight"]
+    touched = 100 * straight["touched"] / straight["flights"]
+    slow, fast = (f"{case['vfh']['mean_speed']:.1f} m/s" for case in easy)
+    speed = result("performance/forest")
+    rate = round(speed["steps_per_second"]["depth"], -3)
+    check(
+        "tasks",
+        f"of 100 flights straight at the goal {touched:.0f} touch a trunk",
+        f"with {slow} and {fast} in the mean",
+        f"the env makes {rate:,} steps/s with {speed['drones']:,} drones",
+        f"a wood adds to a physics step is {speed['contact_over_physics']:.1f} times that step",
+    )
+
+
+def test_the_page_of_tasks_tells_what_a_memory_is_good_for() -> None:
+    found = result("memory")
+    shares = {}
+    for name, seeds in found["rows"].items():
+        assert len(seeds) == 3
+        arrived = sum(seed["arrived"] for seed in seeds)
+        shares[name] = arrived / (len(seeds) * found["flights"])
+    assert [found[name] for name in shares] == pytest.approx([*shares.values()], abs=5e-5)
+    with_memory, without, apart, low, high = (
+        f"{100 * found[name]:.0f}" for name in ("gru", "none", "difference", "low", "high")
+    )
+    check(
+        "tasks",
+        f"flies {found['flights']} unseen layouts",
+        f"{with_memory} % arrive with a memory, {without} % without",
+        f"a difference of {apart} points (95 % interval {low} to {high})",
+    )
+
+
+def test_the_table_of_gates_has_what_was_flown() -> None:
+    found = result("seconds_gates")
+    seeds = found["seeds"]
+    assert len(seeds) == 3
+    flights = found["crashes"]["flights"] // found["of"]
+    passed = ", ".join(percent(seed["good"] / flights) for seed in seeds)
+    times = ", ".join(f"{seed['flight_seconds']:.1f}" for seed in seeds)
+    speeds = ", ".join(f"{seed['speed']:.1f}" for seed in seeds)
+    geometric = found["beside"]["geometric"]
+    beside = f"{percent(geometric['good'] / flights)} % | {geometric['flight_seconds']:.1f} s"
+    check(
+        "tasks",
+        f"for {found['processor_seconds']['most']:.0f} s of one processor | {passed} % | "
+        f"{times} s | {speeds} m/s |",
+        f"| {flights:,} unseen tracks for each",
+        f"| `geometric` | {beside} | {geometric['speed']:.1f} m/s |",
+    )
+
+
+def test_the_table_of_dodge_has_what_was_flown() -> None:
+    found = result("seconds_dodge")
+    (seed,) = found["seeds"]
+    means = seed["means"]
+    check(
+        "tasks",
+        f"{seed['processor_seconds']:.0f} s of one processor: not solved | "
+        f"{percent(means['success'])} % | {percent(means['touched'])} % | "
+        f"{seed['flight_seconds']:.1f} s |",
+        f"| {found['crashes']['flights']:,} unseen layouts",
+    )

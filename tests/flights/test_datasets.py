@@ -32,10 +32,10 @@ HOVER = "rotorgram/Hover-v0"
 @contextmanager
 def recording(
     path: Path, env_id: str = ELEVATION, drones: int = 1, faults: FaultConfig | None = None,
-    **options: Any,
+    patience: float = 5, **options: Any,
 ) -> Iterator[Any]:  # fmt: skip
-    """An agent's env over the wire; the agent keeps the journal."""
-    settings: dict[str, Any] = {"timeout": 5, "connect_timeout": 5, "connect": False}
+    """An agent's env over the wire; the agent keeps the journal. `patience`: s, to connect."""
+    settings: dict[str, Any] = {"timeout": 5, "connect_timeout": patience, "connect": False}
     settings["record"] = path
     remote: Any
     if drones == 1:
@@ -176,6 +176,39 @@ def test_minari_reads_it_and_its_env_flies_it_again(
             assert_flies_again(env, seed, episode.actions, recorded, *told)
             assert len(episode.infos["z"]) == len(episode.actions) + 1
             assert episode.infos["elevation_error"].dtype == np.float64
+
+
+def test_ranges_are_lists_in_parquet(tmp_path: Path) -> None:
+    """Those that the agent got; the flight gives them again."""
+    path = tmp_path / "flight.mcap"
+    sensors = {"depth": {"rows": 4, "columns": 6}, "tof": {"model": "multiranger"}}
+    options: dict[str, Any] = {"scene": "forest:3", "episode_length": 20}
+    got = []
+    with recording(path, HOVER, patience=60, sensors=sensors, **options) as remote:
+        got.append(remote.reset(seed=5)[0])
+        remote.action_space.seed(1)
+        ended = False
+        while not ended:
+            observation, _, terminated, truncated, _ = remote.step(remote.action_space.sample())
+            got.append(observation)
+            ended = terminated or truncated
+    assert len(got) > 5
+    table = tmp_path / "flight.parquet"
+    episodes = RecordedEpisodes([path])
+    write_parquet(episodes, table)
+    read = pq.read_table(table)
+    recorded = {}
+    for name, shape in {"depth": (4, 6), "tof": (1, 5)}.items():
+        rows = np.array(read[f"observation.{name}"].to_pylist(), np.float32)
+        recorded[name] = rows.reshape(-1, *shape)
+        assert same(recorded[name], np.stack([one[name] for one in got]))
+    assert len(np.unique(recorded["depth"])) > 24
+    names = [name for name in read.column_names if name.startswith("action")]
+    actions = np.stack([read[name].to_numpy() for name in names], axis=1)[:-1]
+    told = [read[name].to_numpy()[:-1] for name in ("reward", "terminated", "truncated")]
+    told[0] = told[0].astype(np.float64)
+    with gym.make(env_of(episodes.spec), disable_env_checker=True) as env:
+        assert_flies_again(env, 5, actions.astype(np.float32), recorded, *told)
 
 
 def test_flights_on_rigid_have_an_env_too() -> None:

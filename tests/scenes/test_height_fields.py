@@ -13,9 +13,8 @@ from rotorgram.models import InputError
 from rotorgram.models.vehicle import Vehicle
 from rotorgram.scenes import Layouts, Rays, SceneConfig, Solids, kernels
 from rotorgram.sim import make_world
-from worlds import begin
+from worlds import ball_craft, begin
 
-RACER = Path(__file__).parents[1] / "data" / "racer.xml"
 ROOF = """
 [[obstacle]]
 kind = "hfield"
@@ -105,10 +104,7 @@ def test_rays_are_mujocos_and_numba_has_the_bits_of_numpy(
 @pytest.fixture
 def ball(tmp_path: Path) -> Vehicle:
     """A craft whose only solid geom is a ball about its origin, of 0.15 m."""
-    file = tmp_path / "ball.xml"
-    box = '<geom type="box" size="0.1 0.08 0.03"'
-    file.write_text(RACER.read_text().replace(box, '<geom type="sphere" size="0.15"', 1))
-    return Vehicle.load(file)
+    return ball_craft(tmp_path)
 
 
 @pytest.mark.parametrize("backend", ["rigid", "mujoco"])

@@ -57,6 +57,18 @@ def test_without_a_way_there_are_no_points() -> None:
         find_path(wall, [ends[0], (11.0, 0.0, 0.5)], **BOX, radius=0.1)
 
 
+def way_at_one_height(text: str, ends: list[tuple[float, ...]], radius: float) -> np.ndarray:
+    """In one layer of cells, at the height of a flight, to the place near a goal that has room."""
+    solids = Solids.of_scene(text).standing()
+    around = np.array([(x, y, 0.0) for x in range(5) for y in range(5)])
+    places = ends[1] - np.sign(ends[1]) * around
+    (goal, *_) = places[solids.distance(places) > radius + 0.5]
+    wide = max(abs(number) for end in ends for number in end[:2]) + 5
+    height = ends[0][2]
+    low, high = (-wide, -wide, height - 0.25), (wide, wide, height + 0.25)
+    return find_path(solids, [ends[0], goal], low, high, radius=radius)
+
+
 @pytest.mark.parametrize("seed", range(5))
 @pytest.mark.parametrize(
     ("text", "ends", "radius"),
@@ -68,19 +80,27 @@ def test_without_a_way_there_are_no_points() -> None:
         ("maze:{},clear=ends", [(-22, 0, 2), (22, 0, 2)], 0.5),
         ("maze:{}", [(0, 0, 2), (-22.5, 22.5, 2)], 0.5),
         ("maze:{},size=12x30,clear=ends", [(-4, 0, 2), (4, 0, 2)], 0.5),
+        ("hills:{}", [(0, 0, 4), (30, 30, 4)], 0.5),  # around what is higher
     ],
 )
 def test_there_is_a_way_through_every_layout(
     text: str, ends: list[tuple[float, ...]], radius: float, seed: int
 ) -> None:
-    """In one layer of cells, at the height of a flight, to the place near a goal that has room."""
-    solids = Solids.of_scene(text.format(seed)).standing()
-    around = np.array([(x, y, 0.0) for x in range(5) for y in range(5)])
-    places = ends[1] - np.sign(ends[1]) * around
-    (goal, *_) = places[solids.distance(places) > radius + 0.5]
-    wide = max(abs(number) for end in ends for number in end[:2]) + 5
-    low, high = (-wide, -wide, 1.75), (wide, wide, 2.25)
-    assert len(find_path(solids, [ends[0], goal], low, high, radius=radius)) > 10
+    assert len(way_at_one_height(text.format(seed), ends, radius)) > 10
+
+
+def test_there_is_a_way_across_the_airport() -> None:
+    """Around what stands on the straight line."""
+    ends = [(0, 0, 2), (50, 50, 2)]
+    radius = 1.4
+    solids = Solids.of_scene("airport").standing()
+    straight = np.linspace(*ends, 200)
+    assert (solids.distance(straight) < radius).any()
+    way = way_at_one_height("airport", ends, radius)
+    assert abs(way[[0, -1]] - ends).max() <= 0.5
+    assert (solids.distance(way) >= radius).all()
+    length = np.linalg.norm(np.diff(way, axis=0), axis=1).sum()
+    assert 50 * 2**0.5 < length < 55 * 2**0.5
 
 
 @pytest.mark.parametrize(

@@ -1,6 +1,5 @@
 """Rays: the same bits by NumPy and by Numba, against mj_ray, and by hand."""
 
-import hashlib
 import os
 import subprocess
 import sys
@@ -10,8 +9,10 @@ from typing import Any
 import numpy as np
 import pytest
 from rotorgram.models import InputError
-from rotorgram.scenes import Layouts, Rays, Solids, kernels
+from rotorgram.scenes import Layouts, Rays, SceneConfig, Solids, kernels, returns
 from rotorgram.scenes.obstacles import Obstacle
+from rotorgram.scenes.returns import ErrorModel
+from rotorgram.sim.random import words_of
 from sight import OFF, REACH, SENSORS, SIDES, by_mujoco, random_model, random_poses
 
 LEVEL = (1.0, 0.0, 0.0, 0.0)
@@ -117,32 +118,124 @@ def test_each_ray_ends_where_it_should() -> None:
 
 
 CODE = """
-import hashlib, sys
+import ctypes
+import sys
 import numpy as np
-from rotorgram.scenes import Layouts, Rays, Solids, kernels
-assert kernels.compiled()
-dice = np.random.default_rng(3)
-place = dice.uniform((-30, -30, 1), (30, 30, 8), (50, 3))
-turn = dice.normal(size=(50, 4))
-found = Rays.pinhole(24, 32, 90).cast(Layouts.of(Solids.of_scene("forest:1")), place, turn)
-print(hashlib.sha256(found.tobytes()).hexdigest())
+from rotorgram.scenes import Layouts, Rays, kernels, returns
+code, reader = kernels.compiled(), returns.compiled()
+assert code and reader
+given = dict(np.load(sys.argv[1]))
+kinds, tables, which = layouts = [given[name] for name in ("kinds", "tables", "which")]
+points, ways, turns = given["points"], given["ways"], given["turns"]
+sensor = Rays.pinhole(24, 32, 90)
+found = {"rays": sensor.cast(Layouts(kinds, tables), points, turns, which=which)}
+due = np.ones((len(points), 1), bool)
+still, radius = np.float32(0.0), np.float32(0.3)
+layout = ctypes.c_int64, ctypes.c_void_p, ctypes.c_void_p
+nearest, first = (
+    ctypes.CFUNCTYPE(ctypes.c_float, *layout, *[ctypes.c_float] * count)(function.address)
+    for function, count in ((code.nearest, 5), (code.first, 6))
+)
+for left in (still, np.float32(0.5)):
+    gaps = np.empty((len(points), 1), np.float32)
+    code.gaps(*layouts, points[:, None], due, left, radius, gaps)
+    near = []
+    for n, point in zip(which, points):
+        address = kinds.shape[1], kinds[n].ctypes.data, tables[n].ctypes.data
+        near.append(nearest(*address, *point.tolist(), left, radius))
+    found |= {f"gaps {left}": gaps[:, 0], f"nearest {left}": np.float32(near)}
+ends = []
+for n, point, way in zip(which, points, ways):
+    address = kinds.shape[1], kinds[n].ctypes.data, tables[n].ctypes.data
+    ends.append(first(*address, *point.tolist(), *way.tolist()))
+found["first"] = np.float32(ends)
+steps = np.arange(len(points), dtype=np.uint32)
+found["words"] = np.empty((len(points), 768), np.uint32)
+reader.words(given["keys"], np.uint64(7), steps, steps, found["words"])
+ranges = found["rays"].reshape(len(points), 768)
+found["readings"] = np.empty_like(ranges)
+read = given["scale"], given["inner"], found["words"], given["errors"], found["readings"]
+reader.readings(ranges, *read)
+np.savez(sys.argv[2], **found)
 """
+ERRORS = ErrorModel(0.3, 15.0, 0.01, 0.01, 0.003, 0.05, 0.3)
 
 
-def test_cold_and_cached_code_have_the_same_bits(tmp_path: Path, by_numpy: Any) -> None:
-    around = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path)}
-    older = {**around, "NUMBA_CPU_NAME": "haswell", "NUMBA_CPU_FEATURES": "+avx2"}
-    found = {
-        subprocess.check_output([sys.executable, "-c", CODE], env=env, text=True)
-        for env in (around, around, older)
-    }
-    assert any(tmp_path.rglob("*.nbc"))
+def given_to_kernels() -> dict[str, Any]:
+    """A wood, hills, and balls and posts on their ways; sensors at random places in them."""
     dice = np.random.default_rng(3)
-    place = dice.uniform((-30, -30, 1), (30, 30, 8), (50, 3))
-    turn = dice.normal(size=(50, 4))
-    layouts = Layouts.of(Solids.of_scene("forest:1"))
-    slow = by_numpy(Rays.pinhole(24, 32, 90), layouts, place, turn)
-    assert found == {hashlib.sha256(slow.tobytes()).hexdigest() + "\n"}
+    solids = [
+        Solids.ground() + Solids.of_layout(SceneConfig.parse(text), 1)
+        for text in ("forest:1", "hills:1", "traffic:1")
+    ]
+    kinds, tables = Layouts.of(*solids)
+    tables[2, kernels.WAYS, 1 : len(solids[2])] = dice.normal(size=(3, len(solids[2]) - 1))
+    count = 51
+    ways = dice.normal(size=(count, 3))
+    ways /= np.linalg.norm(ways, axis=1, keepdims=True)
+    return {
+        "kinds": kinds,
+        "tables": tables,
+        "which": np.arange(count) % 3,
+        "points": dice.uniform((-30, -30, 1), (30, 30, 8), (count, 3)).astype(np.float32),
+        "ways": ways.astype(np.float32),
+        "turns": dice.normal(size=(count, 4)),
+        "keys": dice.integers(0, 2**32, (count, 2), dtype=np.uint32),
+        "scale": np.full(768, 0.9, np.float32),
+        "inner": np.array([[1, *((np.arange(768) + 1) % 32 > 0)]], np.int32),
+        "errors": ERRORS.numbers(),
+    }
+
+
+def found_by_numpy(given: dict[str, Any], cast: Any) -> dict[str, np.ndarray]:
+    """What the compiled code should find."""
+    kinds, tables, which = layouts = [given[name] for name in ("kinds", "tables", "which")]
+    points, ways, turns = given["points"], given["ways"], given["turns"]
+    count = len(points)
+    sensor = Rays.pinhole(24, 32, 90)
+    found = {"rays": cast(sensor, Layouts(kinds, tables), points, turns, which=which)}
+    due = np.ones((count, 1), bool)
+    for left in (0.0, 0.5):
+        gaps = np.empty((count, 1), np.float32)
+        moved = np.float32(left), np.float32(0.3)
+        kernels.gaps_by_numpy(*layouts, points[:, None], due, *moved, gaps)
+        found |= {f"gaps {left}": gaps[:, 0], f"nearest {left}": gaps[:, 0]}
+    first = [
+        kernels.first_by_numpy(kinds[n], tables[n], point[:, None], way[:, None])[0]
+        for n, point, way in zip(which.tolist(), points, ways, strict=True)
+    ]
+    found["first"] = np.array(first, np.float32)
+    steps = np.arange(count, dtype=np.uint32)
+    found["words"] = words_of(given["keys"], 7, steps, steps, 768)
+    ranges = found["rays"].reshape(count, 768)
+    found["readings"] = np.empty_like(ranges)
+    read = given["scale"], given["inner"], found["words"], given["errors"], found["readings"]
+    returns.by_numpy(ranges, *read)
+    return found
+
+
+@pytest.mark.timeout(300)  # two processes compile everything
+def test_cold_and_cached_code_have_the_same_bits(tmp_path: Path, by_numpy: Any) -> None:
+    """Those of NumPy: rays, distances of both kinds, first solids, random words, readings."""
+    around = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path / "cache")}
+    older = {**around, "NUMBA_CPU_NAME": "haswell", "NUMBA_CPU_FEATURES": "+avx2"}
+    given = given_to_kernels()
+    np.savez(tmp_path / "given.npz", **given)
+    expected = found_by_numpy(given, by_numpy)
+    assert (expected["first"] < REACH).any()
+    assert (expected["gaps 0.0"] != expected["gaps 0.5"]).any()
+    assert 0.1 < (expected["readings"] == ERRORS.reach).mean() < 0.9
+    for name, env in {"cold": around, "cached": around, "older": older}.items():
+        out = tmp_path / f"{name}.npz"
+        subprocess.run(
+            [sys.executable, "-c", CODE, tmp_path / "given.npz", out], env=env, check=True
+        )
+        found = dict(np.load(out))
+        assert found.keys() == expected.keys()
+        for kernel, array in expected.items():
+            assert found[kernel].dtype == array.dtype
+            assert found[kernel].tobytes() == array.tobytes(), (name, kernel)
+    assert any(tmp_path.rglob("*.nbc"))
 
 
 def test_what_is_refused() -> None:

@@ -14,10 +14,10 @@ from rotorgram.scenes import SCENES, Draft, SceneConfig, SceneType, Solids, kern
 from rotorgram.scenes.motion import along_ellipse
 from rotorgram.sim import make_world
 from rotorgram.sim.scenery import FAR
-from worlds import begin
+from worlds import BALL_RADIUS as RADIUS
+from worlds import ball_craft, begin
 
 RACER = Path(__file__).parents[1] / "data" / "racer.xml"
-RADIUS = 0.15
 DENSE = "forest:new,density=0.05,size=40x30,clear=ends"
 BACKENDS = pytest.mark.parametrize("backend", ["rigid", "mujoco"])
 
@@ -25,11 +25,7 @@ BACKENDS = pytest.mark.parametrize("backend", ["rigid", "mujoco"])
 @pytest.fixture
 def ball(tmp_path: Path) -> Vehicle:
     """A craft whose only solid geom is a ball about its origin."""
-    file = tmp_path / "ball.xml"
-    box = '<geom type="box" size="0.1 0.08 0.03"'
-    sphere = f'<geom type="sphere" size="{RADIUS}"'
-    file.write_text(RACER.read_text().replace(box, sphere, 1))
-    return Vehicle.load(file)
+    return ball_craft(tmp_path)
 
 
 def at(count: int, height: float) -> np.ndarray:
@@ -53,9 +49,17 @@ def near_surfaces(scene: SceneConfig, seed: int, count: int) -> np.ndarray:
     return near[:count]
 
 
-@pytest.mark.parametrize(
-    "text", ["forest:3", "warehouse:1", "gates:2", "gates:2-4", "airport", "hills:5", DENSE]
-)
+PLACES = [
+    "forest:3", "warehouse:1", "gates:2", "gates:2-4", "airport", "hills:5", "maze:3", "aisles:1",
+    "traffic:5", DENSE,
+]  # fmt: skip
+
+
+def test_a_ball_is_placed_in_every_scene() -> None:
+    assert {SceneConfig.parse(text).name for text in PLACES} == {*SCENES} - {"plain"}
+
+
+@pytest.mark.parametrize("text", PLACES)
 def test_touch_contact_and_distance_agree_within_a_millimetre(ball: Vehicle, text: str) -> None:
     assert ball.radius == pytest.approx(RADIUS)
     scene = SceneConfig.parse(text)
