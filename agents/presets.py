@@ -35,7 +35,8 @@ class Preset:
     """Drones that fly at the same time."""
     env_steps: int = 200_000
     """Of all drones together."""
-    backend: Backend = "mujoco"
+    backend: Backend | None = None
+    """Of the training; None: the task's."""
 
     def whole_worlds(self, drones: int) -> int:
         """`num_envs` in whole worlds of so many drones, one at least."""

@@ -148,12 +148,12 @@ def print_episode(trajectory: Trajectory) -> None:
 
 @contextmanager
 def local_env(
-    command: EnvFlags, num_envs: int, backend: Backend | BackendConfig
+    command: EnvFlags, num_envs: int, backend: Backend | BackendConfig | None
 ) -> Iterator["LocalVectorEnv"]:
     """A vector env in this process, without autoreset."""
     from ..envs.vector import LocalVectorEnv  # what only speaks UDP needs no MuJoCo
 
-    config = command.env_config(backend=backend)
+    config = command.env_config(backend=backend or command.backend)
     with closing(LocalVectorEnv(config, num_envs, autoreset_mode="Disabled")) as env:
         print("flying in this process (--udp: over UDP, with a simulator)")
         yield env
@@ -166,7 +166,7 @@ def remote_env(
     required: bool = True,
     num_envs: int | None = 1,
     num_simulators: int = 1,
-    backend: Backend | BackendConfig = "mujoco",
+    backend: Backend | BackendConfig | None = None,
 ) -> Iterator["RemoteVectorEnv"]:
     """A remote env with a simulator of its own, on a backend, or those that come to
     `command.listen`; at the end the counters of the wire are printed.
@@ -197,7 +197,7 @@ def remote_env(
                 "got them for a simulator of our own on this machine"
             )
         task_type(env_id)  # raises for one that is not known here
-        config = command.env_config(backend=backend)
+        config = command.env_config(backend=backend or command.backend)
         drones = num_envs or command.drones
         opened = spawn_simulator(config, num_envs=drones, record=command.record)
     with opened as env:

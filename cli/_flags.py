@@ -128,6 +128,8 @@ class EnvFlags(Command):
     observe=estimate. docs/sensors.md lists them."""
     drones: Count = 1
     """Drones of each world, for a task of several."""
+    backend: Backend | None = None
+    """What steps the drones: mujoco, or rigid (without contact, fast). Default: the task's."""
     options: Suppress[Fixed[dict]] = field(default_factory=dict)  # type: ignore[type-arg]
     """Options of the task that --env names."""
 
@@ -140,8 +142,8 @@ class EnvFlags(Command):
         """The env of the flags."""
         from ..envs.config import EnvConfig
 
-        env = {"vehicle": self.vehicle, "drones": self.drones, **self.options}
-        return EnvConfig.from_keywords(self.env_id, **env, **settings)
+        env = {"vehicle": self.vehicle, "drones": self.drones, "backend": self.backend}
+        return EnvConfig.from_keywords(self.env_id, **{**env, **self.options, **settings})
 
     @property
     def shown_scene(self) -> str | None:
@@ -152,14 +154,7 @@ class EnvFlags(Command):
         return str(scene) if scene and len(SceneConfig.parse(scene).given_scenes) == 1 else None
 
 
-class BackendFlags(EnvFlags):
-    """A command that chooses what steps the drones."""
-
-    backend: Backend = "mujoco"
-    """What steps the drones: mujoco, or rigid (without contact, fast)."""
-
-
-BackendOfPreset = Annotated[Backend, arg(help_behavior_hint="(default: the preset's)")]
+BackendOfPreset = Annotated[Backend | None, arg(help_behavior_hint="(default: the preset's)")]
 """Type of the flag where a preset names the default."""
 
 

@@ -15,7 +15,6 @@ from ..models import InputError
 from ..models.fields import check_fields, immutable
 from ._flags import (
     DEFAULT_ENV,
-    BackendFlags,
     Command,
     EnvFlags,
     ModuleFlag,
@@ -60,7 +59,7 @@ def _parsed_env(
     given = frozenset(flags)
     env = flags.get("env")
     path = flags.get("config")
-    file = _file_values(kind, path, env) if path else {}
+    file = _file_values(path, env) if path else {}
     env_id = env or file.get("env", DEFAULT_ENV)
     listens = "listen" in given or getattr(kind, "listen", None) is not None
     if listens and ":" not in env_id and not registry.is_known(env_id):
@@ -82,7 +81,7 @@ def _parsed_env(
     return replace(command, options=chosen)
 
 
-def _file_values(kind: type[EnvFlags], path: str, env: str | None) -> Options:
+def _file_values(path: str, env: str | None) -> Options:
     """Values of a config's file by the names of fields. Raises `InputError`."""
     from ..envs.config import KEYWORDS, BackendConfig, read_keywords
     from ..envs.spec import canonical_id
@@ -94,18 +93,17 @@ def _file_values(kind: type[EnvFlags], path: str, env: str | None) -> Options:
             values[key] = options.pop(name)
     if "vehicle" in options:
         values["vehicle"] = ",".join(options.pop("vehicle"))
-    backend = BackendConfig.parse(options.pop("backend", "mujoco"))
-    if issubclass(kind, BackendFlags):
+    if "backend" in options:
+        backend = BackendConfig.parse(options.pop("backend"))
         values["backend"] = backend.name
-    elif backend.name != "mujoco":
-        raise InputError(f"backend: expected mujoco with this command, got {backend.name}")
+        options = {**backend.settings, **options}
     env_id = values.get("env", DEFAULT_ENV)
     own = [name for name in options if name not in KEYWORDS]
     if own and env and canonical_id(env) != canonical_id(env_id):
         raise InputError(
             f"config: expected no options of {env_id} with --env {env}, got {', '.join(own)}"
         )
-    return {**values, "options": {**backend.settings, **options}}
+    return {**values, "options": options}
 
 
 def _merged(command: EnvFlags, given: frozenset[str], own: Options, file: Options) -> EnvFlags:

@@ -107,7 +107,8 @@ class StudyFlags(TrainingFlags, WorkersConfig):
 
         if is_controller(agent):
             return Row(agent=agent, name=name, env=env)
-        settings: Options = {"env_steps": 200_000, "num_envs": env.drones, "backend": "mujoco"}
+        backend = env.backend.name
+        settings: Options = {"env_steps": 200_000, "num_envs": env.drones, "backend": backend}
         settings |= self._given(_OF_ROWS)
         return Row(agent=agent, name=name, env=env, set=changes, **settings)
 

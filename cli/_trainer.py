@@ -60,7 +60,7 @@ def begin(command: "Train") -> int:
             f"derives from: it gets {got}; --preset-of ID names another"
         )
     config = preset(command.algorithm, command.preset, task, **command.changes())
-    backend = command.backend if "backend" in command.given else base.backend
+    backend = command.backend or base.backend
     run = Run(
         env=command.env_config(backend=backend),  # it refuses wrong drones
         algorithm=command.algorithm,
@@ -109,7 +109,11 @@ def resume(command: "Train", folder: Path) -> int:
 
 
 def _opened(
-    command: "Train", num_envs: int, backend: Backend | BackendConfig, *, required: bool = True
+    command: "Train",
+    num_envs: int,
+    backend: Backend | BackendConfig | None,
+    *,
+    required: bool = True,
 ) -> AbstractContextManager[AdvancingVectorEnv]:
     """The env of a training, in this process or over UDP."""
     of_paper = command.algorithm in _OF_THE_PAPER and command.env_id == DEFAULT_ENV

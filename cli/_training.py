@@ -9,10 +9,10 @@ from pathlib import Path
 from ..agents.presets import PresetName
 from ..flights.folders import LOCK, new_folder
 from ..models import InputError
-from ._flags import BackendFlags, Count, NamedValues, Options, Words, parse_value
+from ._flags import Count, EnvFlags, NamedValues, Options, Words, parse_value
 
 
-class TrainingFlags(BackendFlags):
+class TrainingFlags(EnvFlags):
     """A command that trains."""
 
     set: NamedValues = ()

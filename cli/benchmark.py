@@ -21,7 +21,7 @@ class Benchmark(StudyFlags):
 
     rows: Positional[Annotated[Path | None, arg(metavar="FILE")]] = None
     """TOML file of rows. Default: those of docs/baselines.md."""
-    backend: BackendOfPreset = "mujoco"
+    backend: BackendOfPreset = None
     """What steps the drones in training: mujoco, or rigid (without contact, fast)."""
 
     def study(self) -> Study:

@@ -54,7 +54,7 @@ class Compare(StudyFlags):
         return replace(studies[0], rows=tuple(rows), kind="compare", **settings)
 
     def _of_agents(self) -> Study:
-        env = self.env_config()
+        env = self.env_config(backend=None)
         changes = self.changes()
         if not self.agents:
             raise InputError("agents: expected at least one, got none")

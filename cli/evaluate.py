@@ -4,10 +4,10 @@ from typing import Annotated
 
 from tyro.conf import Positional, arg
 
-from ._flags import AgentFlags, BackendFlags, Count
+from ._flags import AgentFlags, Count
 
 
-class Evaluate(AgentFlags, BackendFlags):
+class Evaluate(AgentFlags):
     """Measure a trained policy or a controller over episodes without exploration."""
 
     policy: Positional[Annotated[str, arg(metavar="POLICY")]]
@@ -26,7 +26,7 @@ class Evaluate(AgentFlags, BackendFlags):
 
         checkpoint = load_pilot(self.policy)
         command = in_unseen(fitted(self, checkpoint))
-        with remote_env(command, num_envs=command.drones, backend=self.backend) as env:
+        with remote_env(command, num_envs=command.drones) as env:
             headline = Headline.of(env.env_spec)
             policy = policy_for(command, checkpoint, env.env_spec)
             trajectories = fly_episodes(env, policy, self.episodes, "final")

@@ -3,8 +3,9 @@
 import math
 from typing import Annotated
 
-from tyro.conf import Positional, arg
+from tyro.conf import Positional, Suppress, arg
 
+from ..models import Backend
 from ._flags import AgentFlags, Count
 
 
@@ -18,6 +19,8 @@ class Serve(AgentFlags):
     """Checkpoint, folder of a training, pid, geometric, or FILE.py:CLASS of a controller."""
     listen: Annotated[str | None, arg(metavar="HOST:PORT")] = "127.0.0.1:8001"
     """Address to wait at."""
+    backend: Suppress[Backend | None] = None
+    """Refused: the simulators that come have theirs."""
     episodes: Count | None = None
     """End after so many episodes. Default: go on until Ctrl-C."""
 

@@ -4,10 +4,10 @@ from contextlib import ExitStack
 from typing import Literal
 
 from ..models import InputError
-from ._flags import BackendFlags, WireFlags, Words, parse_address
+from ._flags import WireFlags, Words, parse_address
 
 
-class Sim(BackendFlags, WireFlags):
+class Sim(WireFlags):
     """Simulate drones for an agent: the UDP client.
 
     Waits for the agent, flies by its commands and ends when it closes. An agent that is killed and
@@ -45,7 +45,7 @@ class Sim(BackendFlags, WireFlags):
             raise InputError("--server: cannot be used with --agents")
         agents = [parse_address(agent) for agent in self.agents] if several else None
         simulator = Simulator(
-            self.env_config(backend=self.backend),
+            self.env_config(),
             server=parse_address(self.server),
             agents=agents,
             num_envs=self.num_envs,

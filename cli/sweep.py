@@ -55,7 +55,9 @@ class Sweep(StudyFlags):
                 changes[name] = value
         words = [f"{name}={json.dumps(value)}" for name, value in point.items()]
         name = " ".join(words).replace('"', "").replace(", ", ",")
-        return self.new_row(self.algorithm, name, changes, self.env_config().changed(**options))
+        return self.new_row(
+            self.algorithm, name, changes, self.env_config(backend=None).changed(**options)
+        )
 
 
 def parse_grid(words: Iterable[str]) -> dict[str, Values]:

@@ -22,7 +22,7 @@ class Train(AgentFlags, TrainingFlags):
 
     algorithm: Positional[AlgorithmName]
     """What learns: docs/algorithms/ has a page on each."""
-    backend: BackendOfPreset = "mujoco"
+    backend: BackendOfPreset = None
     """What steps the drones: mujoco, or rigid (without contact, fast)."""
     preset_of: str | None = None
     """Id of the task with the preset. Default: the one that is trained, or that it derives from."""

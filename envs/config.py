@@ -119,7 +119,8 @@ class EnvConfig:
     cameras: tuple[str, ...] = ()
     """Pictures that are observed: cameras of the vehicle as NAME, NAME_KIND or
     NAME@WIDTHxHEIGHT."""
-    backend: BackendConfig = BackendConfig()
+    backend: BackendConfig = None  # type: ignore[assignment]  # as the scene
+    """None given: the task's, `mujoco` for most."""
     files: Options = field(default_factory=dict, hash=False, repr=False)
     """Content of the files of `vehicle` by their names, as `models/bundle` has it; set by
     `resolve`, which needs the files themselves no more."""
@@ -132,7 +133,7 @@ class EnvConfig:
         check_fields(self)
         set_fields(self, env_id=canonical_id(self.env_id), vehicle=self.vehicle or ())
         task = registry.task_type(self.env_id) if registry.is_known(self.env_id) else None
-        defaults: Values = {"sensors": {}}
+        defaults: Values = {"sensors": {}, "backend": BackendConfig()}
         if task:
             defaults |= {name: getattr(task, name) for name in _FROM_TASK}
             defaults |= task.defaults
@@ -185,12 +186,12 @@ class EnvConfig:
         nested = options.pop("task", {})
         given = {name: keywords[name] for name in KEYWORDS if keywords.get(name) is not None}
         settings = {name: given.pop(name) for name in BACKEND_KEYWORDS if name in given}
-        if settings:
-            backend = BackendConfig.parse(given.get("backend", "mujoco"))
-            given["backend"] = replace(backend, **settings)
         if isinstance(nested, Mapping):
             nested = {**options, **nested}
-        return cls(env_id=env_id, task=nested, **given)
+        config = cls(env_id=env_id, task=nested, **given)
+        if settings:
+            config = replace(config, backend=replace(config.backend, **settings))
+        return config
 
     def flat_options(self) -> Values:
         """Keywords of everything but the vehicle, the drones and the backend, as JSON values.
@@ -199,8 +200,7 @@ class EnvConfig:
         """
         values: Values = {name: getattr(self, name) for name in _OPTIONS}
         values["effects"] = self.effects.to_options()
-        own: Any = {"scene": None, "sensors": None}
-        usual = replace(self, **own)  # with those of the task, which follow from its options
+        usual = self._usual()
         scene = self.scene
         if (
             scene.name == usual.scene.name and usual.scene.options
@@ -219,9 +219,14 @@ class EnvConfig:
         values: Values = {"env_id": self.own_task or self.env_id}
         if self.vehicle:
             values["vehicle"] = list(self.vehicle)
-        if self.backend != BackendConfig():
+        if self.backend != self._usual().backend:
             values["backend"] = asdict(self.backend)
         return {**values, "drones": self.drones, **self.flat_options()}
+
+    def _usual(self) -> Self:
+        """The same with what the task says of scene, sensors and backend."""
+        own: Any = dict.fromkeys(("scene", "sensors", "backend"))
+        return replace(self, **own)
 
     def unseen(self) -> Self:
         """The same for tests: in layouts that no training has seen."""

@@ -131,7 +131,7 @@ def _levels() -> dict[str, Case]:
         task = registry.task_type(env_id)
         name = short(env_id)
         for level in task.actions:
-            cases[f"{name}, {level}"] = Case(env_id, {"action": level})
+            cases[f"{name}, {level}"] = Case(env_id, {"action": level, "backend": "mujoco"})
             on_rigid = env_id == HOVER or level in (*task.actions[:1], task.action)
             if on_rigid and name not in ("Cable", "PayloadHover"):
                 options = {"action": level, "backend": "rigid"}
@@ -166,7 +166,8 @@ def stormy(env_id: str, file: Path, *, hangs: bool = True) -> Case:
     if own or not hangs:
         del effects["payload"], effects["cable"]
     drawn = {"mass": "uniform(0.9, 1.1)"}
-    return Case(env_id, {"vehicle": file, "effects": effects, "randomize": drawn})
+    options = {"vehicle": file, "effects": effects, "randomize": drawn, "backend": "mujoco"}
+    return Case(env_id, options)
 
 
 def _vehicles() -> dict[str, Case]:

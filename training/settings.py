@@ -83,7 +83,7 @@ class Row:
     name: str = ""
     """Unique in the study. Default: agent, preset, changes and env in words."""
     env: EnvConfig = field(default_factory=EnvConfig)
-    """It is evaluated on `mujoco`."""
+    """It is evaluated on its backend: `mujoco` or the task's."""
     backend: Backend | None = None
     """What steps the drones in training; None: as the preset says."""
     preset: PresetName = "tuned"
@@ -109,10 +109,11 @@ class Row:
             needed = find_controller(self.agent).options if self.controller else {}
             set_fields(self, brought=dict(needed))
         check_fields(self)
+        of_task = EnvConfig(env_id=self.env.env_id)
         backend = self.env.backend.name
-        if backend != "mujoco":
+        if backend not in ("mujoco", of_task.backend.name):
             raise InputError(f"env: expected the backend mujoco, for evaluation, got {backend}")
-        usual = EnvConfig(env_id=self.env.env_id).flat_options()
+        usual = of_task.flat_options()
         given = self.env.flat_options()
         brought = {k: v for k, v in (self.brought or {}).items() if given.get(k) == usual.get(k)}
         if brought:
@@ -127,7 +128,7 @@ class Row:
             self,
             env_steps=self.env_steps or found.env_steps,
             num_envs=self.num_envs or found.whole_worlds(self.env.drones),
-            backend=self.backend or found.backend,
+            backend=self.backend or found.backend or backend,
             set=json.loads(json.dumps(dict(self.set))),
         )
         try:
@@ -178,7 +179,7 @@ class Row:
 
     def run(self, seed: int) -> Run:
         """The training of a seed."""
-        backend = replace(self.env.backend, name=self.backend or "mujoco")
+        backend = replace(self.env.backend, name=self.backend or self.env.backend.name)
         return Run(
             env=replace(self.env, backend=backend),
             algorithm=self.agent,

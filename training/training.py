@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 _TELL_EVERY = 0.2  # s
 
 
-def config_of(spec: EnvSpec, backend: Backend, vehicle: str | None = None) -> EnvConfig:
+def config_of(spec: EnvSpec, backend: Backend | None, vehicle: str | None = None) -> EnvConfig:
     """The config of a simulator's env, as far as its spec has it. Raises `InputError`."""
     options = spec.options if is_known(spec.env_id) else {"task": spec.options}
     return EnvConfig.from_keywords(

@@ -9,8 +9,9 @@ from ...models.fields import immutable
 from ...scenes import SceneConfig
 from ...sim import Array, Draw, InitialState, exp
 from ..state import State
-from .goal import LEAST_CLEARANCE, SUCCESS, TOUCHED, Distance, Point, Tilt
+from .goal import Distance, Point, Tilt
 from .hover import Hover, HoverOptions
+from .measures import METRICS, begin_measures, measures_of, update_measures
 from .task import Outcome
 
 _LIDAR = {"model": "os0", "rows": 10, "columns": 48, "low": -30.0, "high": 45.0}
@@ -65,8 +66,10 @@ class Dodge(Hover):
     action = "velocity"
     control_period = 0.04
     episode_length = 300
-    defaults = MappingProxyType({"vehicle": ("hummingbird",), "sensors": {"lidar": _LIDAR}})
-    metrics = (SUCCESS, TOUCHED, *Hover.metrics, LEAST_CLEARANCE)
+    defaults = MappingProxyType(
+        {"vehicle": ("hummingbird",), "backend": "rigid", "sensors": {"lidar": _LIDAR}}
+    )
+    metrics = (*METRICS, *Hover.metrics)
 
     @classmethod
     def scene(cls, options: Any) -> SceneConfig:
@@ -75,20 +78,17 @@ class Dodge(Hover):
 
     def begin(self, mask: Array, draw: Draw) -> InitialState:
         """See the class."""
-        start = super().begin(mask, draw)
-        self.memory.least = np.inf
-        return start
+        begin_measures(self)
+        return super().begin(mask, draw)
 
     def update_memory(self, state: State) -> None:
-        """What came nearest."""
-        self.memory.least = np.minimum(self.memory.least, state.clearance)
+        """Measure the step."""
+        update_measures(self, state)
 
     def outcome(self, state: State) -> Outcome:
         """That of `Hover`, with the cost of what is near."""
         outcome = super().outcome(state)
         outcome.reward["nearness"] = -_NEAR * exp(-np.maximum(state.clearance, 0.0) / 0.5)
         lasted = state.time > (self.episode_length - 0.5) * self.control_period
-        outcome.metrics["success"] = (lasted > outcome.terminated) * 1.0
-        outcome.metrics["touched"] = state.touching * 1.0
-        outcome.metrics["least_clearance"] = np.minimum(self.memory.least, state.clearance)
+        outcome.metrics.update(measures_of(self, state, lasted > outcome.terminated))
         return outcome

@@ -21,22 +21,19 @@ from ...sim import (
     stack,
     total,
 )
-from ..spec import ArraySpec, Metric
+from ..spec import ArraySpec
 from ..state import State
 from .goal import (
-    FLIGHT_TIME,
-    LEAST_CLEARANCE,
     LEAST_TILT_COSINE,
     MAX_RATE,
     MAX_SPEED,
-    SUCCESS,
-    TOUCHED,
     Number,
     NumberOrRange,
     along,
     array_of,
     ends_of,
 )
+from .measures import METRICS, begin_measures, measures_of, update_measures
 from .task import Outcome, Task, TaskOptions
 
 AISLE = 2.0
@@ -122,17 +119,11 @@ class Forest(Task):
     defaults = MappingProxyType(
         {
             "vehicle": ("hummingbird",),
+            "backend": "rigid",
             "sensors": {"depth": {"rows": 6, "columns": 32, "fov": 120.0}},
         }
     )
-    metrics = (
-        SUCCESS,
-        TOUCHED,
-        Metric(name="mean_speed", unit="m/s", goal="high", final=True),
-        Metric(name="top_speed", unit="m/s", goal="high", final=True),
-        LEAST_CLEARANCE,
-        FLIGHT_TIME,
-    )
+    metrics = METRICS
 
     @classmethod
     def scene(cls, options: Any) -> SceneConfig:
@@ -185,8 +176,8 @@ class Forest(Task):
         memory.height = height[..., 1]
         memory.speed = draw.uniform(*ends_of(self.options.speed))
         memory.way = 2 * self._half
-        memory.progress = memory.change = memory.path = memory.top = 0.0
-        memory.least = np.inf
+        memory.progress = memory.change = 0.0
+        begin_measures(self)
         memory.last = np.zeros_like(height, shape=(*mask.shape, len(self.controller.components)))
         return InitialState(position=stack((-self._half, 0.0, height[..., 0])))
 
@@ -195,7 +186,7 @@ class Forest(Task):
         return stack((self._half, 0.0, self.memory.height))
 
     def update_memory(self, state: State) -> None:
-        """How much shorter the way became; what was flown; what came nearest."""
+        """How much shorter the way became, and how much the action changed."""
         memory = self.memory
         way = self.way(state.position)
         memory.progress = memory.way - way
@@ -203,10 +194,7 @@ class Forest(Task):
         change = state.action - memory.last
         memory.change = total(change * change)
         memory.last = 1.0 * state.action
-        speed = length(state.velocity)
-        memory.path = memory.path + speed * self.control_period
-        memory.top = np.maximum(memory.top, speed)
-        memory.least = np.minimum(memory.least, state.clearance)
+        update_measures(self, state)
 
     def observe(self, state: State) -> dict[str, Array]:
         """See the class."""
@@ -253,8 +241,7 @@ class Forest(Task):
             | (abs(position[..., 0]) > self._half + _BEHIND)
             | (position[..., 2] > self.ceiling)
         )
-        touched = state.touching
-        crashed = touched | beside | (state.tilt_cosine < LEAST_TILT_COSINE)
+        crashed = state.touching | beside | (state.tilt_cosine < LEAST_TILT_COSINE)
         success = arrived > crashed
         speed = length(state.velocity)
         most = _FAST * self.control_period
@@ -267,15 +254,7 @@ class Forest(Task):
             "arrival": _ARRIVAL * success,
             "termination": self.crash(crashed),
         }
-        time = np.maximum(state.time, self.control_period)
-        metrics = {
-            "success": success * 1.0,
-            "touched": touched * 1.0,
-            "mean_speed": memory.path / time,
-            "top_speed": memory.top,
-            "least_clearance": np.minimum(memory.least, state.clearance),
-            "flight_time": state.time,
-        }
+        metrics = measures_of(self, state, success)
         return Outcome(reward=terms, terminated=crashed | success, metrics=metrics)
 
     def way(self, position: Array) -> Array:

@@ -8,9 +8,11 @@ from ...models.fields import Limits, immutable
 from ...scenes import SceneConfig
 from ...scenes.generators import GATES_SIZE, OPENING
 from ...sim import Array, Draw, InitialState, square_root, stack
+from ..state import State
 from .goal import Distance, Margin
+from .measures import METRICS, begin_measures, measures_of, update_measures
 from .racing import Laps, Racing
-from .task import TaskOptions
+from .task import Outcome, TaskOptions
 
 _COUNT = 8
 _RING = 40.0  # m: width of the ring of gates, and their highest, at the scale 1
@@ -49,7 +51,11 @@ class Gates(Racing):
 
     ## Reward
 
-    That of `Racing-v0`, and so are its metrics.
+    That of `Racing-v0`.
+
+    ## Metrics
+
+    Those of `Racing-v0` and of `Forest-v0`; success: all gates are passed.
 
     ## Start, termination, truncation
 
@@ -60,6 +66,7 @@ class Gates(Racing):
     """
 
     Options = GatesOptions
+    metrics = (*Racing.metrics, *METRICS[:-1])  # the time of flight is of both
     defaults = MappingProxyType({"vehicle": ("hummingbird",)})
 
     @classmethod
@@ -94,8 +101,21 @@ class Gates(Racing):
         offset = self.offset(draw)
         track = draw.openings + 0.0 * offset[..., None, :1]
         self.memory.track = track
+        begin_measures(self)
         c, s = track[..., 0, 3], track[..., 0, 4]
         behind = _BEHIND * self.config.scene.values.scale
         position = track[..., 0, :3] - behind * stack((c, s, 0.0)) + offset
         w = square_root((1.0 + c) / 2)  # the first gate faces left of the ring: c > -0.5
         return self.start(position, stack((w, 0.0 * c, 0.0 * c, s / (2 * w))))
+
+    def update_memory(self, state: State) -> None:
+        """That of `Racing`, and measure the step."""
+        super().update_memory(state)
+        update_measures(self, state)
+
+    def outcome(self, state: State) -> Outcome:
+        """That of `Racing`, with the measures."""
+        outcome = super().outcome(state)
+        is_done = outcome.metrics["gates_left"] < 0.5
+        outcome.metrics.update(measures_of(self, state, is_done))
+        return outcome

@@ -59,9 +59,6 @@ class Number(NamedTuple):
 # Metrics of several tasks.
 POSITION_ERROR = Metric(name="position_error", unit="m", settled=0.1, held=0.1, symbol="e")
 PAYLOAD_ERROR = Metric(name="payload_error", unit="m", settled=0.1, held=0.1, symbol="e")
-SUCCESS = Metric(name="success", unit="", goal="high", held=0.5, final=True)
-TOUCHED = Metric(name="touched", unit="", final=True)
-LEAST_CLEARANCE = Metric(name="least_clearance", unit="m", goal="high", final=True)
 FLIGHT_TIME = Metric(name="flight_time", unit="s", final=True)
 
 NumberOrRange = float | tuple[float, float]

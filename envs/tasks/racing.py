@@ -145,7 +145,7 @@ class Racing(GoalTask):
     Options: ClassVar[type[TaskOptions]] = RacingOptions
     worst_step = COURSE_WORST_STEP
     episode_length = 1500
-    metrics = (
+    metrics: ClassVar[tuple[Metric, ...]] = (
         Metric(name="gates_left", unit="", settled=0.5, held=0.5, final=True),
         FLIGHT_TIME,
         Metric(name="lap_time", unit="s", final=True),

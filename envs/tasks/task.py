@@ -81,7 +81,7 @@ class Task(ABC):
         min_drones, max_drones: Drones of one world; the task separates their starts.
         actions: Action levels at which the task can be flown.
         action, control_period, episode_length: Defaults of an `EnvConfig`.
-        defaults: Further ones: its fields `vehicle` and `sensors`, where they are empty.
+        defaults: Further ones: its fields `vehicle`, `sensors` and `backend`, where they are empty.
         has_radio: Whether drones hear each other: see `stages/radio.py`.
         worst_step: No step's reward is lower, but for terms that add up to a difference, as
             progress does.

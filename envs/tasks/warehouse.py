@@ -76,6 +76,7 @@ class Warehouse(Forest):
     defaults = MappingProxyType(
         {
             "vehicle": ("crazyflie2",),
+            "backend": "rigid",
             "sensors": {"tof": {"model": "vl53l5cx", "reach": 2.0}},
         }
     )

@@ -74,7 +74,7 @@ def test_help(command: list[str], capsys: Capsys) -> None:
 
 @pytest.mark.parametrize(
     ("command", "default"),
-    [("train", "the preset's"), ("benchmark", "the preset's"), ("compare", "mujoco")],
+    [("train", "the preset's"), ("benchmark", "the preset's")],
 )
 def test_help_names_the_default_backend(command: str, default: str, capsys: Capsys) -> None:
     words = " ".join(run(capsys, command, "--help")[1].replace("│", " ").split())

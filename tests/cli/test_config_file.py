@@ -11,12 +11,14 @@ from rotorgram.cli import main
 from rotorgram.cli._parser import parse
 from rotorgram.cli.compare import Compare
 from rotorgram.cli.evaluate import Evaluate
+from rotorgram.cli.serve import Serve
 from rotorgram.cli.view import View
-from rotorgram.envs import EnvConfig, LocalVectorEnv
+from rotorgram.envs import LocalVectorEnv
 from rotorgram.models import QUAD_XML
 from rotorgram.models.errors import InputError
 
 HOVER = "rotorgram/Hover-v0"
+FOREST = "rotorgram/Forest-v0"
 FILE = f'env_id = "{HOVER}"\nhistory = 2\n[effects]\ngusts = 2\n'
 RIGID = '[backend]\nname = "rigid"\ndtype = "float64"\n'
 
@@ -29,15 +31,33 @@ def parsed(kind: Any, path: Path, text: str, *words: str) -> Any:
 def test_settings_of_the_backend_reach_the_env(tmp_path: Path) -> None:
     command = parsed(Evaluate, tmp_path / "drone.toml", FILE + RIGID)
     assert command.backend == "rigid"
-    config = EnvConfig.from_keywords(command.env_id, backend=command.backend, **command.options)
+    config = command.env_config()
+    assert config.backend.name == "rigid"
     assert config.backend.dtype == "float64"
     assert config.history == 2
     assert config.effects.gusts == 2.0
 
 
-def test_a_command_of_one_backend_refuses_another(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"^backend: expected mujoco with this command, got rigid"):
-        parsed(View, tmp_path / "drone.toml", FILE + RIGID)
+@pytest.mark.parametrize("kind", [Evaluate, View])
+def test_a_flag_wins_over_a_file_and_a_file_over_the_task(kind: Any, tmp_path: Path) -> None:
+    path = tmp_path / "drone.toml"
+    wood = f'env = "{FOREST}"\n'
+    on_mujoco = '[backend]\nname = "mujoco"\n'
+
+    def backend(text: str, *words: str) -> str:
+        return str(parsed(kind, path, text, *words).env_config().backend.name)
+
+    assert backend(wood) == "rigid"
+    assert backend(wood + on_mujoco) == "mujoco"
+    assert backend(wood, "--backend", "mujoco") == "mujoco"
+    assert backend(wood + on_mujoco, "--backend", "rigid") == "rigid"
+    assert backend(FILE) == "mujoco"
+
+
+def test_a_server_has_no_backend(tmp_path: Path) -> None:
+    command = parsed(Serve, tmp_path / "drone.toml", FILE + RIGID)
+    with pytest.raises(InputError, match=r"^backend: expected it of the simulator that comes"):
+        command.run()
 
 
 def test_another_task_takes_the_world_of_a_file_and_not_its_options(tmp_path: Path) -> None:

@@ -2,8 +2,11 @@
 
 import numpy as np
 import pytest
+from contracts import NOW
 from rotorgram.envs import Loop
 from rotorgram.envs.config import EnvConfig
+
+from flights import Shares, state_of, task_of
 
 DODGE = "rotorgram/Dodge-v0"
 
@@ -47,6 +50,34 @@ def test_where_nothing_comes_it_succeeds() -> None:
     assert metrics["touched"] == pytest.approx(0.0)
     assert (metrics["position_error"] < 0.1).all()
     assert (metrics["least_clearance"] > 100).all()
+    assert metrics["flight_time"] == pytest.approx(12.0)
+    assert (metrics["mean_speed"] < 0.1).all()
+
+
+def test_speeds_and_clearance_by_hand() -> None:
+    """Steps of 0.04 s at 5 m/s and at 1 m/s, 0.4 m and 0.7 m off, the second touching."""
+    task = task_of(DODGE)
+    task.begin(NOW, Shares((0.5, 0.5, 0.5), 0.0, 0.5, 0.5))
+    at_goal = {"position": (0.0, 0.0, 2.0)}
+    first = state_of(**at_goal, velocity=(3.0, 0.0, 4.0), known_clearance=0.4, time=0.04)
+    task.update_memory(first)
+    second = state_of(
+        **at_goal, velocity=(0.0, 1.0, 0.0), known_clearance=0.7, time=0.08, touching=True
+    )
+    task.update_memory(second)
+    metrics = task.outcome(second).metrics
+    expected = {
+        "success": 0,
+        "touched": 1,
+        "mean_speed": 3.0,
+        "top_speed": 5.0,
+        "least_clearance": 0.4,
+        "flight_time": 0.08,
+        "position_error": 0,
+        "heading_error": 0,
+    }
+    assert {name: float(metrics[name]) for name in expected} == pytest.approx(expected)
+    assert [metric.name for metric in task.metrics] == list(expected)
 
 
 def test_success_counts_at_the_end_alone() -> None:

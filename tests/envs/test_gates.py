@@ -46,6 +46,38 @@ def test_gates_are_passed_in_order_and_direction() -> None:
     assert left(task, 4.1, 0.0, 2.0) == 6
 
 
+def test_success_is_a_passage_of_all_gates() -> None:
+    task, _ = begun()
+    found = []
+    for x in range(8):
+        state = state_of(position=(4.0 * x + 0.1, 0.0, 2.0), time=0.5 * (x + 1))
+        task.update_memory(state)
+        found.append(task.outcome(state).metrics["success"])
+    assert found == [0, 0, 0, 0, 0, 0, 0, 1]
+
+
+def test_speeds_and_clearance_by_hand() -> None:
+    """Steps of 0.02 s at 5 m/s and at 1 m/s, 0.4 m and 0.7 m off, the second touching."""
+    task, _ = begun()
+    first = state_of(velocity=(3.0, 0.0, 4.0), known_clearance=0.4, time=0.02)
+    task.update_memory(first)
+    second = state_of(velocity=(0.0, 1.0, 0.0), known_clearance=0.7, time=0.04, touching=True)
+    task.update_memory(second)
+    metrics = task.outcome(second).metrics
+    expected = {
+        "gates_left": 8,
+        "flight_time": 0.04,
+        "lap_time": 0,
+        "success": 0,
+        "touched": 1,
+        "mean_speed": 3.0,
+        "top_speed": 5.0,
+        "least_clearance": 0.4,
+    }
+    assert {name: float(value) for name, value in metrics.items()} == pytest.approx(expected)
+    assert [metric.name for metric in task.metrics] == list(expected)
+
+
 @pytest.mark.parametrize(
     ("action", "expected"),
     [
@@ -101,6 +133,10 @@ def test_a_frame_ends_the_episode() -> None:
     loop, ended = flown(45)
     assert ended.all()
     assert (loop.metrics["gates_left"] == 8).all()
+    assert (loop.metrics["touched"] == 1).all()
+    assert (loop.metrics["success"] == 0).all()
+    assert (loop.metrics["least_clearance"] < 0.02).all()
+    assert (loop.metrics["top_speed"] < 2.0).all()  # commands of 1 m/s and 1.5 m/s
     away = np.linalg.norm(loop.telemetry["position"] - loop.telemetry["goal"], axis=1)
     assert (away < math.hypot(0.75 + 0.25, 0.5)).all()
     loop.close()

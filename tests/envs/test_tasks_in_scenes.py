@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from contracts import loop_of
-from rotorgram.envs.config import EnvConfig
+from rotorgram.envs.config import BackendConfig, EnvConfig
 from rotorgram.models import InputError
 from rotorgram.scenes import Solids
 
@@ -49,6 +49,25 @@ def test_a_scene_without_options_has_those_of_the_task() -> None:
         config = EnvConfig.from_keywords(f"rotorgram/{name}-v0", scene=given, **options)
         assert str(config.scene) == expected
         assert EnvConfig.from_keywords(**config.keywords()) == config
+
+
+@pytest.mark.parametrize("name", ["Forest", "Warehouse", "Dodge"])
+def test_some_tasks_fly_on_rigid_unless_told_otherwise(name: str) -> None:
+    env_id = f"rotorgram/{name}-v0"
+    config = EnvConfig(env_id=env_id)
+    assert config.backend == BackendConfig(name="rigid")
+    assert "backend" not in config.keywords()
+    in_double = EnvConfig.from_keywords(env_id, dtype="float64")
+    assert in_double.backend == BackendConfig(name="rigid", dtype="float64")
+    other = EnvConfig.from_keywords(env_id, backend="mujoco")
+    assert other.backend == BackendConfig(name="mujoco")
+    for made in (config, in_double, other, other.unseen(), other.changed(episode_length=9)):
+        assert EnvConfig.from_keywords(**made.keywords()) == made
+        assert EnvConfig.from_dict(made.to_dict()) == made
+    assert config.changed(backend="mujoco") == other
+    assert other.changed(backend="rigid") == config
+    with pytest.raises(InputError, match="num_threads: expected none with the backend rigid"):
+        EnvConfig.from_keywords(env_id, num_threads=2).resolve()
 
 
 @pytest.mark.parametrize(

@@ -159,7 +159,9 @@ def test_who_does_not_know_it_refuses_it_by_name(scene: str) -> None:
 
 @pytest.mark.parametrize("compiled", [True, False])
 def test_a_task_that_reads_distances_refuses_it(scene: str, compiled: bool) -> None:
-    env = gym.make("rotorgram/Dodge-v0", scene=scene, compiled=compiled, sensors={})
+    env = gym.make(
+        "rotorgram/Dodge-v0", scene=scene, backend="mujoco", compiled=compiled, sensors={}
+    )
     words = r"a task that reads distances.* own/hull_1/hull$"
     with closing(env), pytest.raises(InputError, match=words):
         env.reset(seed=0)

@@ -303,6 +303,13 @@ def test_a_row_trains_on_the_backend_of_its_preset_or_its_own() -> None:
     assert row.run(0).env.backend.name == "rigid"
     assert row.env.backend.name == "mujoco"
     assert Row(agent="ppo", env=hover, backend="mujoco").run(0).env.backend.name == "mujoco"
+    forest = EnvConfig(env_id="rotorgram/Forest-v0")
+    assert Row(agent="geometric", env=forest).env.backend.name == "rigid"
+    assert Row(agent="a2c", env=forest).run(0).env.backend.name == "rigid"  # without a preset
+    on_mujoco = Row(agent="ppo", env=forest.changed(backend="mujoco"))
+    assert on_mujoco.env.backend.name == "mujoco"
+    assert on_mujoco.run(0).env.backend.name == "rigid"
+    assert Row.from_dict("here", json.loads(json.dumps(on_mujoco.to_dict()))) == on_mujoco
     with pytest.raises(InputError, match=r"ppo tuned Hover-v0: env_steps: expected at least"):
         Row(agent="ppo", env=hover, env_steps=100)
 

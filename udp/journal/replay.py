@@ -131,7 +131,7 @@ class Verification(Recording):
     Args:
         path: The journal.
         vehicle: File or name of the vehicle that was flown; None: the paper's.
-        backend: What stepped the drones; None: what the journal says, else `mujoco`.
+        backend: What stepped the drones; None: what the journal says, else the task's.
 
     Attributes:
         sessions: The verdict on each.
@@ -145,7 +145,7 @@ class Verification(Recording):
         backend: Backend | None = None,
     ) -> None:
         super().__init__(path)
-        stepped_by = backend or self.about.get("backend", "mujoco")
+        stepped_by = backend or self.about.get("backend")
         flown: dict[str, object] = {"vehicle": vehicle, "backend": stepped_by}
         self.sessions: list[SessionVerdict] = []
         flying: dict[int, SessionVerdict] = {}  # the last of each slot
