@@ -322,6 +322,7 @@ class EnvConfig:
         Raises `InputError`.
         """
         from ..sim.scenery import solids_around
+        from ..sim.sensors.range_sensors import mounted
         from ..sim.world import check_world
 
         task = registry.task_type(self.env_id)
@@ -349,7 +350,10 @@ class EnvConfig:
             if sensor in self.sensors:
                 refuse_hidden(hidden, f"the sensor {sensor}")
         resolved = replace(
-            whole, vehicle_hash=vehicle.hash, task_hash=source_hash(task, self.scene.type.draw)
+            whole,
+            sensors=mounted(self.sensors, vehicle),
+            vehicle_hash=vehicle.hash,
+            task_hash=source_hash(task, self.scene.type.draw),
         )
         for name in ("vehicle_hash", "task_hash"):
             was = getattr(self, name)

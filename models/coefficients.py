@@ -2,7 +2,7 @@
 
 `coefficients.toml` has the name, limits, unit and meaning of each. An MJCF file has them as custom
 numerics named "rotorgram/GROUP.NAME" (`rotorgram/rotors.radius`), and a vehicle's TOML file as NAME
-in the table GROUP. SI units; body axes x forward, y left, z up.
+in the table GROUP. SI units, but degrees of sensors with rays; body axes x forward, y left, z up.
 """
 
 from collections.abc import Mapping
@@ -11,18 +11,33 @@ from functools import cache
 from typing import Annotated, Any
 
 from .errors import InputError
-from .fields import Limits, OrNone, check, check_names
+from .fields import Limits, OrNone, T, check, check_names
 from .files import read_own_toml
 
 PREFIX = "rotorgram/"
 _GROUPS = read_own_toml(__file__, "coefficients")
 _NUMBERS = read_own_toml(__file__, "numbers")
+RANGE_MODELS = read_own_toml(__file__, "range_sensors")
+"""Settings of sensors with rays by kind and model; the first model of a kind is its default."""
+RANGE_DEFAULTS = RANGE_MODELS.pop("defaults")
+"""Settings where the model has none."""
+_RAYS = RANGE_MODELS.pop("limits")
+for _kind, _models in RANGE_MODELS.items():
+    for _model, _numbers in _models.items():
+        _own = {} if "directions" in _numbers else _RAYS[_kind]
+        _GROUPS[f"sensors.{_kind}.{_model}"] = {**_own, **_RAYS["all"]}
 COEFFICIENTS = {
     f"{group}.{name}": Limits(**row)
     for group, rows in _GROUPS.items()
     for name, row in rows.items()
 }
 """The limits of every coefficient, by "group.name"."""
+
+
+def of_group(group: str, values: Mapping[str, T]) -> dict[str, T]:
+    """Those of a group among values by "group.name", by their names there."""
+    rows = [(*name.rpartition("."), value) for name, value in values.items()]
+    return {name: value for own, _, name, value in rows if own == group}
 
 
 class Coefficients(dict[str, Any]):
@@ -51,8 +66,8 @@ class Coefficients(dict[str, Any]):
         """From numbers and lists of numbers by "group.name". Raises `InputError`."""
         values = cls(dict.fromkeys(COEFFICIENTS))
         for name, value in numbers.items():
-            group = name.partition(".")[0]
-            known = [one for one in COEFFICIENTS if one.startswith(f"{group}.")]
+            group = name.rpartition(".")[0]
+            known = [f"{group}.{one}" for one in of_group(group, COEFFICIENTS)]
             check_names([name], known or COEFFICIENTS, "vehicle")
             values[name] = check(name, COEFFICIENTS[name], value)
         return values

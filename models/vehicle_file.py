@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .cameras import AHEAD, ORIGIN, OUTPUTS, UP, Axis, Camera, Place, steps_of
-from .coefficients import COEFFICIENTS, table_of
+from .coefficients import COEFFICIENTS, RANGE_MODELS, table_of
 from .errors import InputError, shortened
 from .fields import (
     Choice,
@@ -92,6 +92,15 @@ class RotorTable(table_of("rotors")):  # type: ignore[misc]
 
     frame: Literal["plus", "cross", "hexa", "octo"] | None = None
     list: tuple[PlacedRotor, ...] = ()
+
+
+@immutable
+class SensorTable(table_of("sensors")):  # type: ignore[misc]
+    """Coefficients of sensors, and tables of those with rays, which are not read yet."""
+
+    depth: object = None
+    lidar: object = None
+    tof: object = None
 
 
 @immutable
@@ -191,8 +200,9 @@ def read_vehicle_file(path: Path) -> VehicleFile:
     body = _body(numbers, file.body, model)
     rotors = _rotors(numbers, file.rotors, model)
     cameras = [_camera(numbers, one, where) for where, one in _listed(file.cameras, "cameras")]
-    for group in ("drag", "battery", "sensors", "real_flights"):
+    for group in ("drag", "battery", "real_flights"):
         _table(numbers, table_of(group), tree.get(group, {}), group)
+    _sensors(numbers, tree.get("sensors", {}), path.name)
     physical = {key: value for key, value in tree.items() if key != "real_flights"}
     return VehicleFile(
         name=file.name,
@@ -406,6 +416,24 @@ def _camera(numbers: _Found, given: object, where: str) -> Camera:
     steps_of(where, camera.rate)
     ordered = tuple(kind for kind in OUTPUTS if kind in camera.kinds)
     return replace(camera, kinds=ordered, up=up)
+
+
+def _sensors(numbers: _Found, given: object, file: str) -> None:
+    """The table of sensors. Raises `InputError`, which names the file."""
+    try:
+        sensors = _table(numbers, SensorTable, given, "sensors")
+        for kind, models in RANGE_MODELS.items():
+            given = getattr(sensors, kind)
+            if given is None:
+                continue
+            where = f"sensors.{kind}"
+            table = {"position": ORIGIN, **mapping(given, where)}
+            model = table.pop("model", next(iter(models)))
+            check(f"{where}.model", Choice(tuple(models)), model)
+            group = f"{where}.{model}"
+            _table(numbers, table_of(group), table, group)
+    except InputError as error:
+        raise InputError(f"{file}: {error}") from None
 
 
 def inertia_matrix(values: Sequence[float]) -> NDArray[np.float64]:

@@ -1,39 +1,27 @@
 """Sensors with many rays: depth cameras, lidars and time-of-flight arrays.
 
-They see the solids of a layout. `range_sensors.toml` has their models.
+They see the solids of a layout. `models/range_sensors.toml` has their models.
 """
 
 import math
-from collections.abc import Mapping
 from functools import cached_property
 from typing import Any
 from zlib import crc32
 
 import numpy as np
 
-from ...models.errors import InputError
+from ...models import InputError, Vehicle
+from ...models.coefficients import COEFFICIENTS, RANGE_DEFAULTS, RANGE_MODELS, of_group
 from ...models.fields import Choice, Limits, check
-from ...models.files import read_own_toml
 from ...scenes import Layouts, Rays, returns
 from ...scenes.rays import MAX_PLACE, MAX_REACH
 from ...scenes.returns import RANGES, ErrorModel, Reading
 from ..random import words_of
 from ..rotations import to_world
 from ..state import Array, ByName, clip
-from .base import SAMPLING, Setting, Values, checked_settings, sampling, setting_of
+from .base import Setting, Values, checked_settings, sampling
 from .instruments import Instrument, Moment
 
-_TABLES = read_own_toml(__file__, "range_sensors")
-_SETTINGS = {name: setting_of(row) for name, row in _TABLES.pop("settings").items()}
-_SETTINGS |= {name: SAMPLING[name] for name in ("rate", "delay")}
-MODELS: Mapping[str, Mapping[str, Values]] = _TABLES
-"""Settings by kind and model."""
-_PATTERNS = {
-    "depth": ("rows", "columns", "fov"),
-    "lidar": ("rows", "columns", "low", "high"),
-    "tof": ("rows", "columns", "fov"),
-}
-"""Settings of the rays by kind."""
 _BEYOND = 1.001  # of its reach: rays end where nothing returns
 KINDS = RANGES
 """In this order they are observed."""
@@ -41,14 +29,56 @@ KINDS = RANGES
 
 def checked(kind: str, given: Values) -> Values:
     """Settings of a sensor as plain values. Raises `InputError`."""
-    models = Choice(tuple(MODELS[kind]))
+    models = Choice(tuple(RANGE_MODELS[kind]))
     model = check(f"sensors.{kind}.model", models, given.get("model", models.words[0]))
-    others = {name for pattern in _PATTERNS.values() for name in pattern}
-    if "directions" not in MODELS[kind][model]:
-        others -= set(_PATTERNS[kind])
     settings = {"model": Setting(None, models)}
-    settings |= {name: one for name, one in _SETTINGS.items() if name not in others}
-    return checked_settings(kind, settings, {"model": model, **given})
+    for name, limits in of_group(f"sensors.{kind}.{model}", COEFFICIENTS).items():
+        settings[name] = Setting(None, limits)
+    return checked_settings(kind, settings, given)
+
+
+def mounted(sensors: Values, vehicle: Vehicle) -> Values:
+    """The option `sensors`, as of `checked`, over the settings of a vehicle's file.
+
+    A sensor takes the settings that the file has of its model, or of the first model if the option
+    names none. Raises `InputError`, which names the file if its settings do not go together.
+    """
+    merged = dict(sensors)
+    known = {name: value for name, value in vehicle.coefficients.items() if value is not None}
+    for kind in RANGE_MODELS.keys() & sensors.keys():
+        given = sensors[kind]
+        for model in RANGE_MODELS[kind]:
+            own = of_group(f"sensors.{kind}.{model}", known)
+            if own and given.get("model", model) == model:
+                own["model"] = model
+                _completed(kind, own, f"{vehicle.path.name}: sensors.{kind}")
+                merged[kind] = {**own, **given}
+                break
+    return merged
+
+
+def _completed(kind: str, given: Values, where: str) -> Values:
+    """All settings: those given, else those of the model, else the defaults.
+
+    Raises `InputError` where they do not go together; `where` stands before it.
+    """
+    model = given.get("model", next(iter(RANGE_MODELS[kind])))
+    values = {"rate": None, **RANGE_DEFAULTS, **RANGE_MODELS[kind][model], **given}
+    most = values["max_rate"]
+    if (values["rate"] or 0.0) > most:
+        raise InputError(
+            f"{where}.rate: expected at most {most:g} Hz of a {model}, got {values['rate']:g} Hz"
+        )
+    if values["near"] >= values["reach"]:
+        raise InputError(
+            f"{where}.reach: expected more than near = {values['near']:g} m, "
+            f"got {values['reach']:g}"
+        )
+    if kind == "lidar" and values["low"] > values["high"]:
+        raise InputError(
+            f"{where}: expected low <= high, got {values['low']:g} and {values['high']:g} degrees"
+        )
+    return values
 
 
 class RangeSensor(Instrument):
@@ -70,19 +100,11 @@ class RangeSensor(Instrument):
         """From `checked`, with the period of a control step, s; no observation is later than
         `latest` steps besides. Other drones are balls of a radius, m. Raises `InputError`.
         """
-        model = MODELS[kind][given["model"]]
-        defaults = {name: setting.default for name, setting in _SETTINGS.items()}
-        values = {**defaults, **model, **given}
         where = f"sensors.{kind}"
-        most = values["max_rate"]
-        if (values["rate"] or 0.0) > most:
-            raise InputError(
-                f"{where}.rate: expected at most {most:g} Hz of a {values['model']}, "
-                f"got {values['rate']:g} Hz"
-            )
+        values = _completed(kind, given, where)
         every, lag = sampling(where, values["rate"], values["delay"], period)
         if values["rate"] is None:
-            every = max(1, math.ceil(1 / (most * period) - 1e-6))
+            every = max(1, math.ceil(1 / (values["max_rate"] * period) - 1e-6))
         super().__init__({kind: every}, lag, latest)
         self.name = kind
         self._radius = radius
@@ -90,21 +112,16 @@ class RangeSensor(Instrument):
         sensor = _rays_of(kind, values)
         turn = _turn(math.radians(values["yaw"]), math.radians(values["pitch"]))
         along = sensor.directions[..., 0].ravel()
-        self._is_flat = kind != "lidar" and "directions" not in model
+        self._is_flat = kind != "lidar" and "directions" not in values
         self._scale = (along if self._is_flat else np.ones_like(along)).astype(np.float32)
         self._mount = np.array(values["position"])
         self.errors = ErrorModel(**{name: values[name] for name in ErrorModel._fields})
-        if self.errors.near >= self.errors.reach:
-            raise InputError(
-                f"{where}.reach: expected more than near = {self.errors.near:g} m, "
-                f"got {self.errors.reach:g}"
-            )
         self.shape = sensor.directions.shape[:2]
         ends = _BEYOND * self.errors.reach / self._scale
         check(f"{where}: its longest ray", Limits(0.0, MAX_REACH, "m"), float(ends.max()))
         self.rays = Rays(sensor.directions @ turn.T, ends.reshape(self.shape))
         grid = ("ring", "azimuth") if kind == "lidar" else ("row", "column")
-        self.axes = () if "directions" in model else grid
+        self.axes = () if "directions" in values else grid
         what = "along the axis of the sensor" if self._is_flat else "along each ray"
         self.frame = f"body, {what}"
 
@@ -197,12 +214,8 @@ def _rays_of(kind: str, values: Values) -> Rays:
     """In the sensor's frame."""
     if "directions" in values:
         return Rays([values["directions"]])
-    if kind == "lidar" and values["low"] > values["high"]:
-        raise InputError(
-            "sensors.lidar: expected low <= high, "
-            f"got {values['low']:g} and {values['high']:g} degrees"
-        )
-    pattern = [values[name] for name in _PATTERNS[kind]]
+    names = ("low", "high") if kind == "lidar" else ("fov",)
+    pattern = [values[name] for name in ("rows", "columns", *names)]
     return Rays.rings(*pattern) if kind == "lidar" else Rays.pinhole(*pattern)
 
 

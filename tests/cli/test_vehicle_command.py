@@ -62,6 +62,7 @@ def test_show(tmp_path: Path, capsys: Capsys) -> None:
         '[rotors]\nframe = "cross"\narm = 0.3\nthrust = [0, 10]\nreaction = 0.016\n'
         '[[cameras]]\nname = "low"\nresolution = [160, 120]\nrate = 0.5\nlook = [0, 0, -1]\n'
         'kinds = ["rgb", "depth"]\nfovy = 1.0\n'
+        '[sensors.lidar]\nmodel = "os0"\nyaw = { value = 90, source = "drawing 12" }\n'
     )
     out = vehicle(capsys, "show", file)
     assert out.startswith(f"shown ({file})\n")
@@ -77,6 +78,7 @@ def test_show(tmp_path: Path, capsys: Capsys) -> None:
         "57.3 degrees high, every 2 steps",
         "body.mass = 2 kg\n    scales\n    why: with battery\n    also 1.9 kg: maker",
         "rotors.arm = 0.3 m",
+        "sensors.lidar.os0.yaw = 90 degrees\n    drawing 12",
     ):
         assert f"\n{line}\n" in out
     for what in (DATA / "tiny.xml", Vehicle.load().path):

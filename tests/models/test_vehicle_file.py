@@ -569,7 +569,10 @@ TABLES = {
 
 def limits_of_all() -> dict[str, Limits]:
     """Of every number of a file, by its dotted name."""
-    found = dict(COEFFICIENTS)
+    found: dict[str, Limits] = {}
+    for name, limits in COEFFICIENTS.items():
+        known = re.sub(r"^sensors\.\w+\.\w+\.", "sensors.KIND.", name)  # of all kinds and models
+        assert found.setdefault(known, limits) == limits, name
     for prefix, kind in (*TABLES.items(), ("body.parts.", vehicle_file.Cylinder)):
         found |= {prefix + name: limits for name, limits in limits_of(kind).items()}
     return found

@@ -17,7 +17,7 @@ from rotorgram.flights.trajectories import Trajectory, flown_trajectories
 from rotorgram.rendering import Canvas, Stage
 from rotorgram.rendering.insets import add_insets
 from rotorgram.scenes.returns import Reading
-from rotorgram.sim.sensors.range_sensors import RangeSensor, checked
+from rotorgram.sim.sensors.range_sensors import RangeSensor
 from rotorgram.udp.spawn import spawn_simulator
 
 HOVER = "rotorgram/Hover-v0"
@@ -35,7 +35,7 @@ def one_ray(distance: float, point: tuple[float, ...], origin: tuple[float, ...]
 def test_points_are_where_rays_ended() -> None:
     """Turned to the left by a right angle, 10 cm ahead of the middle of the craft."""
     settings = {"model": "multiranger", "position": (0.1, 0.0, 0.0)}
-    sensor = RangeSensor("tof", checked("tof", settings), 0.02, 0)
+    sensor = RangeSensor("tof", settings, 0.02, 0)
     half = np.sqrt(0.5)
     pose = np.array((1.0, 2.0, 3.0, half, 0.0, 0.0, half))
     read = sensor.reading(np.array([[2.0, 1.0, 0.5, sensor.errors.reach, 3.0]], np.float32), pose)

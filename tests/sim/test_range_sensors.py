@@ -7,8 +7,9 @@ import pytest
 from rotorgram.envs import Loop
 from rotorgram.envs.config import EnvConfig
 from rotorgram.models import InputError
+from rotorgram.models.coefficients import RANGE_MODELS as MODELS
 from rotorgram.scenes import Layouts, Rays, Solids
-from rotorgram.sim.sensors.range_sensors import KINDS, MODELS
+from rotorgram.scenes.returns import RANGES
 
 WOOD = "forest:3,density=0.1,size=34x16,clear=ends"
 EXACT: dict[str, Any] = {"growth": 0.0, "edge_dropout": 0.0, "near": 0.01}
@@ -133,7 +134,7 @@ def test_observations_are_copies() -> None:
 
 
 def test_every_model_says_where_its_numbers_come_from() -> None:
-    assert set(MODELS) == set(KINDS)
+    assert set(MODELS) == set(RANGES)
     for models in MODELS.values():
         for model in models.values():
             assert len(model["source"]) > 30
