@@ -135,6 +135,7 @@ class EnvConfig:
         task = registry.task_type(self.env_id) if registry.is_known(self.env_id) else None
         defaults: Values = {"sensors": {}, "backend": BackendConfig()}
         if task:
+            check_names(task.defaults, _DEFAULTS, f"{self.env_id}: defaults")
             defaults |= {name: getattr(task, name) for name in _FROM_TASK}
             defaults |= task.defaults
         missing = [name for name in defaults if getattr(self, name) in (None, ())]
@@ -378,6 +379,7 @@ class EnvConfig:
         return _hash_of(json.dumps(content, sort_keys=True, separators=(",", ":")))
 
 
+_DEFAULTS = ("vehicle", "sensors", "backend")
 _FROM_TASK = ("action", "control_period", "episode_length")
 _OPTIONS = (
     "episode_length", "action", "control_period", "history", "effects", "randomize", "sensors",

@@ -77,6 +77,15 @@ def test_defaults_come_from_the_task() -> None:
     assert formation.episode_length == 500
 
 
+def test_a_default_that_is_none_of_a_config(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Hold, "defaults", {"colour": "red"})
+    expected = (
+        r"^config/Hold-v0: defaults: expected some of vehicle, sensors, backend, got 'colour'$"
+    )
+    with pytest.raises(InputError, match=expected):
+        EnvConfig(env_id="config/Hold-v0")
+
+
 def test_the_record_as_json_and_as_a_pickle() -> None:
     config = EnvConfig.from_keywords("rotorgram/Formation-v0", **FULL)
     content = config.to_dict()
