@@ -70,8 +70,8 @@ def test_a_checkpoint_on_film_flies_as_it_does_over_the_wire(
     journal = tmp_path / "flight.mcap"
     assert run(capsys, "evaluate", training, "--episodes", 2, "--record", journal)[0] == 0
     trained = load(training / "checkpoint.safetensors")
-    assert trained.options["episode_length"] == 25
-    config = EnvConfig.from_keywords(trained.env_id, **trained.options)
+    assert trained.spec.options["episode_length"] == 25
+    config = EnvConfig.from_keywords(trained.env_id, **trained.spec.options)
     (flown,) = flown_trajectories(trained.policy(), config, [1], "final")
     (recorded,) = recorded_trajectories(journal, [1])
     for name, values in flown.telemetry.items():
@@ -272,7 +272,7 @@ def comparison(training: Path, tmp_path: Path) -> Results:
     data = (training / "checkpoint.safetensors").read_bytes()
     (folder / "checkpoints" / "a2c-seed0.safetensors").write_bytes(data)
     trained = load(training / "checkpoint.safetensors")
-    env = EnvConfig.from_keywords(trained.env_id, **trained.options)
+    env = EnvConfig.from_keywords(trained.env_id, **trained.spec.options)
     rows = tuple(Row(agent=agent, name=agent, env=env) for agent in ("a2c", "pid"))
     specs = dict.fromkeys(("a2c", "pid"), trained.spec)
     write_config(folder, "", Study(rows=rows, seeds=1), specs)
