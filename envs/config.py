@@ -275,6 +275,11 @@ class EnvConfig:
         return f"{self.module}:{self.env_id}" if self.module else None
 
     @property
+    def has_rays(self) -> bool:
+        """Whether there are sensors with rays, to which a vehicle's file may add settings."""
+        return not self.sensors.keys().isdisjoint(RANGES)
+
+    @property
     def estimated(self) -> bool:
         """Whether controller and observation get the onboard estimate, once a control step."""
         return self.sensors.get("observe") == "estimate"

@@ -306,7 +306,7 @@ class EnvSpec(_Part):
 
     @property
     def fps(self) -> int:
-        """Steps per second, rounded, at least 1: of films."""
+        """Control steps per second, rounded, at least 1: `render_fps` of Gymnasium's metadata."""
         return max(1, round(1 / self.control_period))
 
     @property

@@ -35,7 +35,7 @@ COEFFICIENTS = {
 
 
 def of_group(group: str, values: Mapping[str, T]) -> dict[str, T]:
-    """Those of a group among values by "group.name", by their names there."""
+    """Values of one group by name, from values by "group.name"."""
     rows = [(*name.rpartition("."), value) for name, value in values.items()]
     return {name: value for own, _, name, value in rows if own == group}
 

@@ -36,8 +36,8 @@ def cross(a: Sequence[Array], b: Sequence[Array]) -> Triple:
 def rotation(
     quaternion: Sequence[Array], twice: float | Array = 2.0
 ) -> tuple[Triple, Triple, Triple]:
-    """Matrix from the frame of a unit quaternion, scalar first, to that about it; `twice` is 2 over
-    the squared length of another quaternion.
+    """Rotation matrix of a unit quaternion, scalar first, from body to world frame. `twice` is 2
+    over the squared length of a quaternion of another length.
     """
     w, x, y, z = quaternion
     return (

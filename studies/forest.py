@@ -1,7 +1,7 @@
 """Flight by sight through woods that no training has seen: PPO on Forest-v0, over several seeds.
 
     python studies/forest.py [--seeds 5] [--first-seed 4100] [--flights 1000] [--out FILE.json]
-    python studies/forest.py --vfh    # its flights anew, the others' as they are in the file
+    python studies/forest.py --beside    # flights of controllers anew, the policies' stay
     python studies/forest.py --set network=cnn "filters=[8, 16]" --out docs/results/forest_cnn.json
     python studies/forest.py --set memory=64 "hidden=[64]" --out docs/results/forest_gru.json
 
@@ -23,6 +23,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from argparse import Namespace
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, ClassVar
@@ -119,45 +120,53 @@ def counted(env: LocalVectorEnv, last: np.ndarray) -> dict[str, Any]:
 
 def main() -> None:
     args = options(
-        __doc__, seeds=5, first_seed=4100, flights=1000, hard=30, vfh=False, set=[""],
+        __doc__, seeds=5, first_seed=4100, flights=1000, hard=30, beside=False, set=[""],
         out=RESULTS / "forest.json",
     ).parse_args()  # fmt: skip
-    numbers = range(args.first_seed, args.first_seed + args.seeds)
-    vfh: Any = find_controller("examples/vfh.py:Vfh")
-    if args.vfh:
+    if args.beside:
         content = json.loads(args.out.read_text())
-        for row, case in zip(content["cases"], CASES, strict=True):
-            row["vfh"] = fly_batch(vfh, args.flights, *case, args.first_seed)
+        for row, others in zip(content["cases"], beside(args), strict=True):
+            row |= others
         write(args.out, content)
         return
     changes = [change for change in args.set if change]
     words = [*WORDS, *(["--set", *changes] if changes else [])]
-    beside: list[dict[str, Any]] = [{} for _ in CASES]
+    more: list[dict[str, Any]] = [{} for _ in CASES]
     seeds: list[dict[str, Any]] = []
-    for seed in numbers:
+    for seed in range(args.first_seed, args.first_seed + args.seeds):
         with tempfile.TemporaryDirectory() as folder:
             seconds = train(words, seed, Path(folder) / "run")
             kept = load(Path(folder) / "run" / "checkpoint.safetensors")
         rows = []
-        for case, others in zip(CASES, beside, strict=True):
+        for case, others in zip(CASES, more, strict=True):
             row, flown = fly(kept.policy, args.flights, *case, seed=seed)
             rows.append(row)
             if not seeds:
                 others["traversability"] = round(mean_traversability(flown[: args.hard]), 2)
         seeds.append({"seed": seed, "seconds": seconds, "cases": rows})
         print(seed, seconds, [row["arrived"] for row in rows], flush=True)
-        _write(args.out, words, seeds, beside)
+        _write(args.out, words, seeds, more)
     if not changes:
-        for case, others in zip(CASES, beside, strict=True):
-            others["straight"] = fly_batch(Straight, args.flights, *case, args.first_seed)
-            others["vfh"] = fly_batch(vfh, args.flights, *case, args.first_seed)
-        _write(args.out, words, seeds, beside)
+        more = [row | others for row, others in zip(more, beside(args), strict=True)]
+        _write(args.out, words, seeds, more)
+
+
+def beside(args: Namespace) -> list[dict[str, Any]]:
+    """Flights of the controllers in each of `CASES`, in the layouts of the first policy."""
+    kinds = {"straight": Straight, "vfh": find_controller("examples/vfh.py:Vfh")}
+    return [
+        {
+            name: fly_batch(kind, args.flights, *case, args.first_seed)
+            for name, kind in kinds.items()
+        }
+        for case in CASES
+    ]
 
 
 def _write(
-    out: Path, words: list[str], seeds: list[dict[str, Any]], beside: list[dict[str, Any]]
+    out: Path, words: list[str], seeds: list[dict[str, Any]], more: list[dict[str, Any]]
 ) -> None:
-    cases = [summary(seeds, number) | row for number, row in enumerate(beside)]
+    cases = [summary(seeds, number) | row for number, row in enumerate(more)]
     command = f"rotorgram train {shlex.join(words)}"
     write(out, {"command": command, "cases": cases, "seeds": seeds})
 

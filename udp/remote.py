@@ -79,7 +79,7 @@ class _Remote(NotCopied):
         return self._agent.server.statistics
 
     def _take_actions(self, spec: EnvSpec, drones: int) -> None:
-        """Take what the actions of so many drones are."""
+        """Keep the check of actions of so many drones, and actions that do nothing."""
         self._actions = Actions.of(spec.action, drones)
         self._nothing: Array = np.zeros(self._actions.shape, self._actions.dtype)
 

@@ -49,9 +49,10 @@ def spawn_simulator(
     """
     config = _importable(config)  # before a record is begun
     count = config.drones if num_envs is None else num_envs
+    told = config.resolve() if config.has_rays else config  # with settings of the vehicle's file
     settings: AgentSettings = {
         "env_id": config.env_id,
-        "options": config.flat_options(),
+        "options": told.flat_options(),
         "connect_timeout": _POLL,
         "timeout": _ANSWER_TIMEOUT,
         "record": record,

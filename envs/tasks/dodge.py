@@ -48,7 +48,7 @@ class Dodge(Hover):
 
     ## Reward
 
-    That of `Hover-v0` with s = 2 m, for a craft that moves aside should earn more than one that
+    That of `Hover-v0` with s = 2 m, because a craft that moves aside should earn more than one that
     crashes; and -0.5 exp(-clearance / 0.5 m).
 
     ## Start, termination, truncation

@@ -9,8 +9,10 @@ from rotorgram.envs import Loop
 from rotorgram.envs.config import EnvConfig
 from rotorgram.models import InputError, Vehicle
 from rotorgram.models.export import export_mjcf
+from rotorgram.udp.spawn import spawn_simulator
 
 HOVER = "rotorgram/Hover-v0"
+FOREST = "rotorgram/Forest-v0"
 CRAFT = """
 name = "seer"
 [body]
@@ -213,3 +215,15 @@ def test_several_vehicles_have_no_sensors(tmp_path: Path) -> None:
     pair = config(f"{one},{other}", {"depth": True}, "rotorgram/Formation-v0", drones=2)
     with pytest.raises(InputError, match=r"^sensors: expected none with several vehicles, got dep"):
         pair.resolve()
+
+
+@pytest.mark.parametrize(("env_id", "sensors"), [(HOVER, {"depth": True}), (FOREST, None)])
+def test_a_simulator_of_our_own_has_the_settings_of_the_file(
+    tmp_path: Path, env_id: str, sensors: Any
+) -> None:
+    file = craft(tmp_path, DEPTH.replace("0.04", "0.1"))  # whole control periods of both tasks
+    mounted = config(file, sensors, env_id)
+    with spawn_simulator(mounted) as env:
+        depth = env.env_spec.options["sensors"]["depth"]
+    assert depth["position"] == [0.3, 0.0, 0.1]
+    assert depth["pitch"] == -20.0
