@@ -1,7 +1,7 @@
 # Everything a user needs: `make demo` and `make test` set themselves up in .venv and run.
 PYTHON ?= python3
 BIN := .venv/bin
-PACKAGES := models scenes sim envs udp agents rendering flights training cli
+PACKAGES := models scenes sim envs udp agents rendering flights training autopilots cli
 # The tests start hundreds of short programs: byte code that is kept makes each start faster.
 unexport PYTHONDONTWRITEBYTECODE
 

@@ -2,18 +2,22 @@
 
 import logging
 import time
-from contextlib import closing
+from collections.abc import Iterable
+from contextlib import ExitStack, closing
 from typing import cast
 
 import numpy as np
 
 from ..envs.loop import Loop
 from ..envs.rendering import moments
+from ..flights import filming
+from ..flights.trajectories import Flights
 from ..rendering.live import LiveView, Pace
 from ..rendering.stage import Stage
 from ..scenes import SceneConfig, parse_scene
 from ..udp.protocol.messages import Command
 from ..udp.transport.simulator import Simulator
+from ._env import print_episode
 from ._flags import EnvFlags
 
 _log = logging.getLogger(__name__)
@@ -63,3 +67,26 @@ def open_view(command: EnvFlags, drones: int, flown: SceneConfig, pace: Pace) ->
     """
     scene = parse_scene(command.shown_scene or flown.shown)
     return closing(LiveView(Stage(scene, drones, vehicle=command.vehicle), pace))
+
+
+def show(command: EnvFlags, flights: Iterable[Flights], speed: float = 1.0) -> None:
+    """Show flights in a window at a speed, one after the other, each of all drones of a world."""
+    with ExitStack() as opened:
+        scene = None
+        for flight in flights:
+            first = flight[0]
+            if first.scene != scene:
+                scene = first.scene
+                opened.close()
+                pace = Pace(first.spec.control_period, speed)
+                live = opened.enter_context(open_view(command, len(flight), scene, pace))
+            shown = [filming.moments(one) for one in flight]
+            longest = max(map(len, shown))
+            # A drone whose episode has ended stays as it ended.
+            padded = [own + [own[-1]] * (longest - len(own)) for own in shown]
+            if not all(live.draw_in_time(*frame) for frame in zip(*padded, strict=True)):
+                break
+            for one in flight:
+                print_episode(one)
+        while live.is_running and not live.wants:  # the last picture is still to come
+            time.sleep(0.02)

@@ -1,10 +1,13 @@
 """`rotorgram evaluate`: fly episodes without exploration, print the means."""
 
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import Positional, arg
 
 from ._flags import AgentFlags, Count
+
+if TYPE_CHECKING:
+    from ..flights.trajectories import Flights
 
 
 class Evaluate(AgentFlags):
@@ -17,40 +20,49 @@ class Evaluate(AgentFlags):
 
     def run(self) -> None:
         """Fly and print the means."""
-        import numpy as np
-        import pandas as pd
-
-        from ..flights.trajectories import fly_episodes, mean_traversability
-        from ..training.metrics import Headline, measure_episode
+        from ..flights.trajectories import fly_episodes
+        from ..training.metrics import Headline
         from ._env import fitted, in_unseen, load_pilot, policy_for, remote_env
 
         checkpoint = load_pilot(self.policy)
         command = in_unseen(fitted(self, checkpoint))
         with remote_env(command, num_envs=command.drones) as env:
-            headline = Headline.of(env.env_spec)
+            Headline.of(env.env_spec)  # it names what is measured
             policy = policy_for(command, checkpoint, env.env_spec)
             trajectories = fly_episodes(env, policy, self.episodes, "final")
-        rows = pd.DataFrame([measure_episode(trajectory, headline) for trajectory in trajectories])
-        mean = rows.mean()
-        measures = [f"{mean[name]:.4f}" for name in ("steady", "overshoot")]
-        steady, overshoot = map(headline.amount, measures)
-        print(f"policy     {self.policy} on {trajectories[0].spec.env_id}")
-        crashed = f", {headline.crashed(rows).sum()} crashed" if headline.final else ""
-        print(f"episodes   {len(rows)}, {rows['terminated'].sum()} terminated{crashed}")
-        print(f"return     {mean['return']:.1f}")
-        print(f"steady     {headline.size_symbol} {steady}")
-        if headline.settles:
-            count = rows["settling_time"].count()
-            when = f"{mean['settling_time']:.2f} s" if count else "never"
-            bound = f"{headline.size_symbol} to {headline.amount(f'{headline.settled:g}')}"
-            print(f"settling   {bound}: {when} ({count} of {len(rows)} episodes)")
-        if headline.signed:
-            print(f"overshoot  {overshoot}")
-        ends = np.mean([one.telemetry["metrics"][-1] for one in trajectories], axis=0)
-        for metric, mean_end in zip(trajectories[0].spec.metrics[1:], ends[1:], strict=True):
-            if metric.final:
-                name = metric.name.replace("_", " ")
-                print(f"{name:10} {mean_end:.3g} {metric.unit}".rstrip())
-        hard = mean_traversability(trajectories)
-        if hard == hard:  # no nan
-            print(f"scene      traversability {hard:.1f} radii")
+        print_means(self.policy, trajectories)
+
+
+def print_means(policy: str, trajectories: "Flights") -> None:
+    """Print the means of a policy's flights."""
+    import numpy as np
+    import pandas as pd
+
+    from ..flights.trajectories import mean_traversability
+    from ..training.metrics import Headline, measure_episode
+
+    headline = Headline.of(trajectories[0].spec)
+    rows = pd.DataFrame([measure_episode(trajectory, headline) for trajectory in trajectories])
+    mean = rows.mean()
+    measures = [f"{mean[name]:.4f}" for name in ("steady", "overshoot")]
+    steady, overshoot = map(headline.amount, measures)
+    print(f"policy     {policy} on {trajectories[0].spec.env_id}")
+    crashed = f", {headline.crashed(rows).sum()} crashed" if headline.final else ""
+    print(f"episodes   {len(rows)}, {rows['terminated'].sum()} terminated{crashed}")
+    print(f"return     {mean['return']:.1f}")
+    print(f"steady     {headline.size_symbol} {steady}")
+    if headline.settles:
+        count = rows["settling_time"].count()
+        when = f"{mean['settling_time']:.2f} s" if count else "never"
+        bound = f"{headline.size_symbol} to {headline.amount(f'{headline.settled:g}')}"
+        print(f"settling   {bound}: {when} ({count} of {len(rows)} episodes)")
+    if headline.signed:
+        print(f"overshoot  {overshoot}")
+    ends = np.mean([one.telemetry["metrics"][-1] for one in trajectories], axis=0)
+    for metric, mean_end in zip(trajectories[0].spec.metrics[1:], ends[1:], strict=True):
+        if metric.final:
+            name = metric.name.replace("_", " ")
+            print(f"{name:10} {mean_end:.3g} {metric.unit}".rstrip())
+    hard = mean_traversability(trajectories)
+    if hard == hard:  # no nan
+        print(f"scene      traversability {hard:.1f} radii")

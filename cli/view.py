@@ -1,8 +1,6 @@
 """`rotorgram view`: flights live, flown in process or read from a journal."""
 
-import time
-from contextlib import ExitStack
-from itertools import chain, count, islice
+from itertools import count, islice
 from pathlib import Path
 
 from tyro.conf import Positional
@@ -30,10 +28,8 @@ class View(EnvFlags):
 
     def run(self) -> None:
         """Fly and show, episode after episode."""
-        from ..flights.filming import moments
-        from ..rendering.live import Pace
-        from ._env import pilot_of, print_episode
-        from ._watch import open_view
+        from ._env import pilot_of
+        from ._watch import show
 
         path = Path(self.what)
         shown = self
@@ -45,24 +41,5 @@ class View(EnvFlags):
             shown, policy = pilot_of(self, self.what)
             config = shown.env_config()
             flights = (flown_trajectories(policy, config, [one], "final") for one in count())
-        first = next(flights)
-        pace = Pace(first[0].spec.control_period, self.speed)
         print(f"showing {self.what} in the window (Ctrl-C ends)")
-        with ExitStack() as opened:
-            scene = None
-            for flight in islice(chain((first,), flights), self.episodes):
-                if flight[0].scene != scene:
-                    scene = flight[0].scene
-                    opened.close()
-                    live = opened.enter_context(open_view(shown, len(first), scene, pace))
-                shown_moments = [moments(one) for one in flight]
-                longest = max(map(len, shown_moments))
-                # A drone whose episode has ended stays as it ended.
-                padded = [own + [own[-1]] * (longest - len(own)) for own in shown_moments]
-                frames = zip(*padded, strict=True)
-                if not all(live.draw_in_time(*frame) for frame in frames):
-                    break
-                for one in flight:
-                    print_episode(one)
-            while live.is_running and not live.wants:  # the last picture is still to come
-                time.sleep(0.02)
+        show(shown, islice(flights, self.episodes), self.speed)

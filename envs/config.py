@@ -5,6 +5,7 @@ Defaults come from the task, then from a file, then from flags or keyword argume
 
 import inspect
 import json
+import math
 import sys
 from collections.abc import Mapping
 from dataclasses import asdict, field, fields, replace
@@ -304,7 +305,12 @@ class EnvConfig:
         from ..models.fleet import load_vehicles
 
         words = self.vehicle_paths or None
-        return load_vehicles(words, self.drones, linear_drag=self.effects.linear_drag)
+        return load_vehicles(
+            words,
+            self.drones,
+            linear_drag=self.effects.linear_drag,
+            longest_step=self.control_period or math.inf,
+        )
 
     def embedded(self) -> Self:
         """The same with the content of the files of vehicles and scene, for a process that has not

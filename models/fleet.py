@@ -1,6 +1,7 @@
 """Vehicles of the drones of one world, where they are not all alike."""
 
 import copy
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from functools import partial
@@ -75,12 +76,16 @@ class Fleet(Vehicle):
 
 
 def load_vehicles(
-    vehicle: Path | str | Sequence[str] | None, drones: int, *, linear_drag: float = 0.0
+    vehicle: Path | str | Sequence[str] | None,
+    drones: int,
+    *,
+    linear_drag: float = 0.0,
+    longest_step: float = math.inf,
 ) -> Vehicle:
     """The vehicle of all drones of a world, or a `Fleet` if several are named.
 
     Names or files go to the drones in their order, and repeat from the first if there are more
-    drones. Raises `InputError`.
+    drones. A physics step is at most `longest_step`, s. Raises `InputError`.
     """
     names = vehicle_words(vehicle) or (None,)
     if len(names) > drones:
@@ -89,7 +94,8 @@ def load_vehicles(
             f"vehicle: expected at most one vehicle for each of {drones} drones, "
             f"got {len(names)}: {got}"
         )
-    found = [Vehicle.load(name, linear_drag=linear_drag) for name in names]
+    loaded = [Vehicle.load(name, linear_drag=linear_drag) for name in names]
+    found = [_under(one, min(one.timestep, longest_step), one.gravity) for one in loaded]
     if len(set(found)) == 1:
         return found[0]
     return Fleet.of([found[i % len(found)] for i in range(drones)])

@@ -22,6 +22,7 @@ PACKAGES = (
     "agents",
     "flights",
     "training",
+    "autopilots",
     "cli",
 )
 

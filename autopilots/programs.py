@@ -1,0 +1,142 @@
+"""Programs of others: each in a folder of its own, that ends with this process."""
+
+import os
+import shlex
+import shutil
+import signal
+import socket
+import subprocess
+import weakref
+from collections.abc import Mapping, Sequence
+from contextlib import ExitStack
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+from ..models import InputError
+from ..udp.protocol.errors import PeerClosed, PeerSilent
+
+HOST = "127.0.0.1"
+ANSWER = 5.0
+"""Longest time for an answer, s."""
+_STOP = 3.0  # s, from asking a program to end to killing it
+_LOG = "output.txt"
+
+
+class Program:
+    """A program that runs, with datagrams to and from it. `close` ends it, as does the end of this
+    process. Its folder is removed then.
+
+    Attributes:
+        number: From 0: of several programs of one kind. It moves their ports.
+        folder: Where it runs.
+        link: The socket that gets what the program sends to its simulator.
+    """
+
+    def __init__(
+        self, name: str, own: int, others: Sequence[int] = (), apart: int = 0, most: int = 16
+    ) -> None:
+        """It is the first of `most` programs whose ports on the loopback interface are free: `own`,
+        of `link`, and `others`, which the program will bind, each moved by `apart` a program.
+
+        Raises `InputError` if none are free.
+        """
+        self.name = name
+        self._closing = ExitStack()
+        self._end = weakref.finalize(self, self._closing.close)
+        self.folder = Path(self._closing.enter_context(TemporaryDirectory(prefix="rotorgram-")))
+        self._process: subprocess.Popen[bytes] | None = None
+        self._waits = False  # for a program that the user starts
+        for number in range(most if apart else 1):
+            try:
+                self.link = self.listen(own + number * apart)
+                for port in others:
+                    bound_socket(name, port + number * apart).close()
+            except InputError as error:
+                taken = error
+            else:
+                self.number = number
+                return
+        raise taken
+
+    def start(
+        self,
+        program: Path | str | None,
+        arguments: Sequence[str] = (),
+        environment: Mapping[str, str] = {},
+    ) -> None:
+        """Run it in the folder, its output in a file there. Without a program, say how the user
+        starts it, and wait for it.
+        """
+        if program is None:
+            around = [f"{name}={shlex.quote(value)}" for name, value in environment.items()]
+            words = " ".join([*around, shlex.join([self.name, *arguments])])
+            print(f"{self.name}: waiting for it; start it so:\ncd {self.folder} && {words}")
+            self._waits = True
+            return
+        command = [str(program), *arguments]
+        if not os.access(program, os.X_OK):
+            raise InputError(f"program: expected one that can be run, got {program}")
+        if shutil.which("setpriv"):  # it is killed even if this process is
+            command = ["setpriv", "--pdeathsig", "KILL", *command]
+        log = self._closing.enter_context((self.folder / _LOG).open("wb"))
+        process = subprocess.Popen(
+            command,
+            cwd=self.folder,
+            env={**os.environ, **environment},
+            stdin=subprocess.DEVNULL,
+            stdout=log,
+            stderr=subprocess.STDOUT,
+            process_group=0,
+        )
+        self._process = process
+        self._closing.callback(_stop, process)
+
+    def listen(self, port: int) -> socket.socket:
+        """A socket that gets what the program sends there."""
+        return self._closing.enter_context(bound_socket(self.name, port))
+
+    def receive(self, where: socket.socket | None = None, wait: float = ANSWER) -> bytes:
+        """The next datagram, of `link` unless told otherwise.
+
+        Raises `PeerSilent` where none comes, `PeerClosed` if it has ended.
+        """
+        where = where or self.link
+        where.settimeout(None if self._waits else wait)
+        try:
+            datagram = where.recv(2048)
+            self._waits = False
+            return datagram
+        except TimeoutError:
+            pass
+        status = self._process.poll() if self._process else None
+        if status is None:
+            raise PeerSilent(f"{self.name}: expected an answer within {wait:g} s, got none")
+        words = (self.folder / _LOG).read_text(errors="replace").strip().splitlines()
+        said = words[-1] if words else "it said nothing"
+        raise PeerClosed(f"{self.name}: ended with status {status}: {said}")
+
+    def close(self) -> None:
+        """End it. It may be called again."""
+        self._end()
+
+
+def bound_socket(name: str, port: int) -> socket.socket:
+    """A socket for datagrams on a port. Raises `InputError` if that is taken."""
+    bound = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    try:
+        bound.bind((HOST, port))
+    except OSError:
+        bound.close()
+        raise InputError(
+            f"{name}: expected that port {port} is free, got one in use: does another run?"
+        ) from None
+    return bound
+
+
+def _stop(process: subprocess.Popen[bytes]) -> None:
+    process.send_signal(signal.SIGTERM)
+    try:
+        process.wait(_STOP)
+    except subprocess.TimeoutExpired:
+        process.kill()
+        process.wait()

@@ -1,0 +1,192 @@
+"""The seat of an autopilot: a controller that hands observations to a program, and what its motors
+do to an env of the level `rotors`.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, NamedTuple, Protocol, Self
+
+import numpy as np
+
+from ..agents.policies import Observation
+from ..envs.config import EnvConfig
+from ..envs.spec import EnvSpec
+from ..models import InputError, Vehicle
+from ..udp.protocol.errors import PeerClosed, PeerSilent
+from .reading import Floats, Instruments, Order, Propellers, Reading, exact, heading_of
+
+LONGEST_STAND = 120.0
+"""Time on the ground after which a program that lifts nothing is given up, s of its clock."""
+LIFTED = 0.9
+"""Thrust over the weight at which the craft leaves its stand."""
+
+
+class Stack(Protocol):
+    """A program that runs, as the seat sees it."""
+
+    ready: bool
+    """Whether it takes orders."""
+    why: str
+    """Why it is not ready, or does not lift."""
+    late: int
+    """Steps that were not in lock-step: its outputs were not those of the step's reading."""
+
+    def step(self, reading: Reading, order: Order | None, observation: Observation) -> Floats:
+        """Throttle of each rotor, 0 to 1, shape (R,), after one period of the program's clock.
+
+        Without an order its rotors stay off.
+        """
+
+    def close(self) -> None:
+        """End the program."""
+
+
+class Start(NamedTuple):
+    """How a stack begins."""
+
+    config: EnvConfig
+    """Of the flight, as `seated` makes it."""
+    vehicle: Vehicle
+    mode: str
+    """One of the stack's ways to fly."""
+    program: Path | None
+    """What to run; None where the user runs it."""
+    real_time: bool = False
+    """Whether the program keeps its own clock."""
+
+
+MakeStack = Callable[[Start], Stack]
+
+
+@dataclass
+class Tally:
+    """Of all flights of a seat and of its copies."""
+
+    steps: int = 0
+    """Of programs, those on the stand too."""
+    late: int = 0
+    """Steps that were not in lock-step."""
+    faults: list[str] = field(default_factory=list)
+    """What programs did wrong, a sentence each."""
+
+
+class Seat:
+    """Flies one drone by a program of its own, which begins anew for each episode.
+
+    The craft stands where its episode starts, level, until the program is ready and its rotors
+    carry it: what the program needs to begin is no part of the episode. Then the program steps once
+    in each control step. Throttle u of a rotor asks for the thrust of the vehicle's curve at u, or
+    u² of its largest.
+
+    A program that ends, hangs or sends no number gives no thrust from then on.
+
+    Attributes:
+        lifted_after: Time on the stand, s of the program's clock.
+        tally: What its copies share.
+    """
+
+    def __init__(
+        self, spec: EnvSpec, start: Start, make: MakeStack, tally: Tally | None = None
+    ) -> None:
+        self.tally = tally or Tally()
+        self._arguments = spec, start, make, self.tally
+        self._instruments = Instruments(spec)
+        self._vehicle = vehicle = start.vehicle
+        self._period = spec.control_period
+        self._up = vehicle.thrust_high - vehicle.hover_thrust
+        self._down = vehicle.hover_thrust - vehicle.thrust_low
+        self._propellers = Propellers(start.config, vehicle)
+        self._stack: Stack | None = None
+        self._time = self.lifted_after = 0.0
+        self._failed = False
+
+    def __deepcopy__(self, memo: object) -> Self:
+        """One for another drone, or another flight."""
+        return type(self)(*self._arguments)
+
+    def reset(self) -> None:
+        """End the program: the next observation begins an episode, and a new one."""
+        self.close()
+        self._time = 0.0
+        self._failed = False
+
+    def close(self) -> None:
+        """End the program."""
+        if self._stack is not None:
+            self._stack.close()
+        self._stack = None
+
+    def act(self, observation: Observation) -> Floats:
+        """The action of the level `rotors`, float32, shape (R,)."""
+        seen: Any = observation
+        if self._stack is None and not self._failed:
+            _, start, make, _ = self._arguments
+            self._stack = make(start)
+            self._stand(seen)
+        thrust = self._thrust(seen)
+        over = thrust - self._vehicle.hover_thrust
+        action = np.where(over > 0.0, over / self._up, over / self._down)
+        flown: Floats = action.astype(np.float32)
+        return flown
+
+    def _thrust(self, seen: Any) -> Floats:
+        """Of each rotor, N: what the program asks for, or none where it has failed."""
+        stack = self._stack
+        if stack is not None:
+            reading = self._instruments.reading(seen, self._time)
+            order = self._instruments.order(seen, reading)
+            try:
+                return self._step(stack, reading, order, seen)
+            except (PeerClosed, PeerSilent, InputError) as error:
+                self.tally.faults.append(f"{error}; after {self._time - self.lifted_after:.3f} s")
+                self._failed = True
+                self.close()
+        return np.zeros(self._vehicle.num_rotors)
+
+    def _stand(self, observation: Any) -> None:
+        stack = self._stack
+        assert stack is not None
+        weight = self._vehicle.mass * self._vehicle.gravity
+        lift = 0.0
+        while lift < LIFTED * weight:
+            reading = self._instruments.standing(observation, self._time)
+            order = None
+            if stack.ready:
+                order = Order(reading.position, heading_of(reading.quaternion), stands=True)
+            lift = self._step(stack, reading, order, observation).sum()
+            if self._time > LONGEST_STAND:
+                raise InputError(
+                    f"autopilot: expected that it lifts the craft within {LONGEST_STAND:g} s of "
+                    f"its clock, got {lift:.3g} of {weight:.3g} N: {stack.why}"
+                )
+        self.lifted_after = self._time
+
+    def _step(
+        self, stack: Stack, reading: Reading, order: Order | None, observation: Any
+    ) -> Floats:
+        """Thrust that is asked of each rotor, N."""
+        late = stack.late
+        throttle = stack.step(reading, order, observation)
+        self.tally.steps += 1
+        self.tally.late += stack.late - late
+        if not ((throttle >= 0.0) & (throttle <= 1.0)).all():  # nan is neither
+            got = throttle.tolist()
+            raise InputError(f"autopilot: expected throttles from 0 to 1, got {got}")
+        self._time += self._period
+        return self._propellers.commands(throttle)
+
+
+def seated(config: EnvConfig, rate: float) -> EnvConfig:
+    """The config of a flight from a seat: rotors at the program's rate, in Hz, the same time in an
+    episode, and sensors without errors but for those that are given.
+    """
+    assert config.control_period is not None
+    assert config.episode_length is not None
+    seconds = config.control_period * config.episode_length
+    return config.changed(
+        action="rotors",
+        control_period=1.0 / rate,
+        episode_length=round(seconds * rate),
+        sensors=exact(config.sensors),
+    )

@@ -1,0 +1,153 @@
+"""Programs of others: their folders, ports, ends."""
+
+import os
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import textwrap
+import time
+from pathlib import Path
+
+import pytest
+from rotorgram.autopilots.programs import HOST, Program
+from rotorgram.models import InputError
+from rotorgram.udp.protocol.errors import PeerClosed, PeerSilent
+
+ECHO = """
+import os, socket, sys
+mine = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+mine.sendto(os.getcwd().encode(), ("127.0.0.1", int(sys.argv[1])))
+while True:
+    data, there = mine.recvfrom(100)
+    mine.sendto(data, there)
+"""
+
+
+def free_port():
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as one:
+        one.bind((HOST, 0))
+        return one.getsockname()[1]
+
+
+def started(text, name="echo"):
+    program = Program(name, free_port())
+    port = program.link.getsockname()[1]
+    program.start(sys.executable, ["-c", text, str(port)])
+    return program
+
+
+def runs(pid):
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return False
+    return True
+
+
+def test_it_runs_in_a_folder_of_its_own_that_goes():
+    program = started(ECHO)
+    folder = program.receive().decode()
+    assert folder == str(program.folder.resolve())
+    program.close()
+    assert not program.folder.exists()
+    program.close()
+
+
+def test_one_that_ends_says_what_it_said_last():
+    program = started("import sys; print('first'); sys.exit('no gyro')")
+    with pytest.raises(PeerClosed, match=r"^echo: ended with status 1: no gyro$"):
+        program.receive(wait=5.0)
+    program.close()
+
+
+def test_one_that_hangs_is_named():
+    program = started("import time; time.sleep(60)")
+    with pytest.raises(PeerSilent, match=r"^echo: expected an answer within 0\.1 s, got none$"):
+        program.receive(wait=0.1)
+    program.close()
+
+
+def test_one_that_ignores_the_signal_is_killed():
+    program = started("import signal; signal.signal(signal.SIGTERM, signal.SIG_IGN)" + ECHO)
+    program.receive()
+    began = time.monotonic()
+    program.close()
+    assert time.monotonic() - began < 10.0
+
+
+def test_what_cannot_be_run_is_refused(tmp_path):
+    program = Program("echo", free_port())
+    nothing = tmp_path / "none"
+    for content in (None, "text"):
+        if content:
+            nothing.write_text(content)
+        with pytest.raises(InputError, match=f"expected one that can be run, got {nothing}$"):
+            program.start(nothing)
+    program.close()
+
+
+def test_the_next_program_has_other_ports():
+    port = free_port()
+    first = Program("echo", port, apart=7)
+    second = Program("echo", port, apart=7)
+    assert (first.number, second.number) == (0, 1)
+    assert second.link.getsockname()[1] == port + 7
+    with pytest.raises(InputError, match=f"expected that port {port} is free, got one in use"):
+        Program("echo", port)
+    first.close()
+    third = Program("echo", port, apart=7)
+    assert third.number == 0
+    second.close()
+    third.close()
+
+
+def test_a_port_that_the_program_needs_is_checked():
+    taken = free_port()
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
+        other.bind((HOST, taken))
+        with pytest.raises(InputError, match=f"port {taken} is free"):
+            Program("echo", free_port(), (taken,))
+
+
+def test_nothing_is_left_when_we_are_killed(tmp_path):
+    ours = textwrap.dedent(f"""
+        import sys, time
+        from rotorgram.autopilots.programs import Program
+        program = Program("echo", {free_port()})
+        sleeper = "import os, time; print(os.getpid(), flush=True); time.sleep(60)"
+        program.start(sys.executable, ["-c", sleeper])
+        print(program.folder, flush=True)
+        time.sleep(60)
+    """)
+    process = subprocess.Popen([sys.executable, "-c", ours], stdout=subprocess.PIPE, text=True)
+    folder = process.stdout.readline().strip()
+    deadline = time.monotonic() + 10.0
+    while not (said := (Path(folder) / "output.txt").read_text()):
+        assert time.monotonic() < deadline
+        time.sleep(0.05)
+    process.send_signal(signal.SIGKILL)
+    process.wait()
+    process.stdout.close()
+    while runs(int(said)):
+        assert time.monotonic() < deadline
+        time.sleep(0.05)
+    shutil.rmtree(folder)
+
+
+def test_a_program_of_the_user_is_told_how_and_waited_for(capsys):
+    program = Program("echo", free_port())
+    port = program.link.getsockname()[1]
+    program.start(None, ["-c", ECHO, str(port)], {"SPEED": "1 2"})
+    said = capsys.readouterr().out
+    assert said.startswith("echo: waiting for it; start it so:\n")
+    command = said.split("\n", 1)[1].replace(" echo ", f" {sys.executable} ")
+    with subprocess.Popen(
+        ["sh", "-c", f"exec env {command.split('&& ')[1]}"], cwd=program.folder
+    ) as own:
+        assert program.receive().decode() == str(program.folder.resolve())
+        own.kill()
+    with pytest.raises(PeerSilent, match=r"expected an answer within 0\.1 s"):
+        program.receive(wait=0.1)
+    program.close()
