@@ -66,9 +66,7 @@ class Propellers:
     def __init__(self, config: EnvConfig, vehicle: Vehicle) -> None:
         curve = vehicle.coefficients["rotors.curve"] or (0.0, 0.0, 1.0)
         self._own = np.polynomial.Polynomial(curve)
-        self._asked = self._own
-        if config.effects.thrust_curve:
-            self._asked = np.polynomial.Polynomial((0.0, 1.0))
+        self._asked = (0.0, 1.0) if config.effects.thrust_curve else tuple(curve)
         self._high = vehicle.thrust_high
         self._throttles = np.linspace(0.0, 1.0, 1025)
         self._shares = self._own(self._throttles)
@@ -78,7 +76,10 @@ class Propellers:
 
     def commands(self, throttles: Floats) -> Floats:
         """Commands of the rotors, N, at throttles from 0 to 1, shape (R,)."""
-        return np.asarray(self._high * self._asked(throttles))
+        share = np.zeros_like(throttles)
+        for coefficient in reversed(self._asked):
+            share = share * throttles + coefficient
+        return np.asarray(self._high * share)
 
     def throttle(self, share: float) -> float:
         """At which a rotor gives a share of its largest thrust."""
