@@ -17,7 +17,7 @@ Floats = NDArray[np.float64]
 SENSORS = ("imu", "gps", "motion_capture")
 """What every seat reads."""
 _ERRORS = ("noise", "walk", "bias")
-_GUIDES = ("goal - position", "nose")
+_GUIDES = ("goal - position", "nose", "velocity")
 
 
 class Reading(NamedTuple):
@@ -104,10 +104,10 @@ class Instruments:
 
     def reading(self, observation: Mapping[str, Floats], time: float) -> Reading:
         """Of a craft that flies."""
-        place = observation["motion_capture"].astype(np.float64)
+        gps = observation["gps"].astype(np.float64)
+        quaternion = observation["motion_capture"][3:].astype(np.float64)
         imu = observation["imu"].astype(np.float64)
-        velocity = observation["gps"][3:].astype(np.float64)
-        return Reading(time, place[:3], place[3:], velocity, imu[:3], imu[3:])
+        return Reading(time, gps[:3], quaternion, gps[3:], imu[:3], imu[3:])
 
     def standing(self, observation: Mapping[str, Floats], time: float) -> Reading:
         """Of a craft that is held where it was observed, as it was turned."""
@@ -117,13 +117,28 @@ class Instruments:
         return Reading(time, position, quaternion, rest, rest, up)
 
     def order(self, observation: Mapping[str, Floats], reading: Reading) -> Order:
-        """To the goal of the task, with its heading."""
+        """To the goal of the task, with its heading.
+
+        The goal is where the task has it: motion capture says from where, whatever GPS reads.
+        """
         seen = observation[self._array][self._at].astype(np.float64)
-        x, y, z, nose_x, nose_y, _ = seen.tolist()
+        x, y, z, nose_x, nose_y = seen[:5].tolist()
         turn = heading_of(reading.quaternion) - math.atan2(nose_y, nose_x)
         c, s = math.cos(turn), math.sin(turn)
-        goal = reading.position + np.array((c * x - s * y, s * x + c * y, z))
+        start = observation["motion_capture"][:3].astype(np.float64)
+        goal = start + np.array((c * x - s * y, s * x + c * y, z))
         return Order(goal, math.remainder(turn, math.tau))
+
+    def seen(
+        self, observation: Mapping[str, Floats], reading: Reading, order: Order
+    ) -> Mapping[str, Floats]:
+        """The observation as a pilot outside has it: position and velocity are those of GPS."""
+        c, s = math.cos(order.heading), math.sin(order.heading)
+        into = np.array(((c, s, 0.0), (-s, c, 0.0), (0.0, 0.0, 1.0)))
+        numbers = observation[self._array].copy()
+        numbers[self._at[:3]] = into @ (order.goal - reading.position)
+        numbers[self._at[6:]] = into @ reading.velocity
+        return {**observation, self._array: numbers}
 
 
 def heading_of(quaternion: Floats) -> float:

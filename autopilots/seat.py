@@ -137,7 +137,8 @@ class Seat:
             reading = self._instruments.reading(seen, self._time)
             order = self._instruments.order(seen, reading)
             try:
-                return self._step(stack, reading, order, seen)
+                told = self._instruments.seen(seen, reading, order)
+                return self._step(stack, reading, order, told)
             except (PeerClosed, PeerSilent, InputError) as error:
                 self.tally.faults.append(f"{error}; after {self._time - self.lifted_after:.3f} s")
                 self._failed = True

@@ -31,10 +31,12 @@ class Hovering:
     why: str = "it boots"
     late: int = 0
     seen: list = field(default_factory=list)
+    told: list = field(default_factory=list)
     closed: int = 0
 
     def step(self, reading, order, observation):
         self.seen.append((reading, order))
+        self.told.append(observation["observation"])
         self.ready = reading.time >= self.boot
         if self.late_every and len(self.seen) % self.late_every == 0:
             self.late += 1
@@ -49,12 +51,16 @@ class Hovering:
         self.closed += 1
 
 
-def flown(made, env_id="rotorgram/Hover-v0", steps=40, drones=1, episodes=1, **settings):
+def flown(
+    made, env_id="rotorgram/Hover-v0", steps=40, drones=1, episodes=1, sensors=None, **settings
+):
     """Flights by programs of `settings`, one for each drone in turn, and the seat.
 
     Settings that are tuples go to programs in turn. `made` gets the programs.
     """
-    config = EnvConfig.from_keywords(env_id, vehicle="hummingbird", drones=drones)
+    config = EnvConfig.from_keywords(
+        env_id, vehicle="hummingbird", drones=drones, sensors=sensors or {}
+    )
     config = seated(config, RATE).changed(episode_length=steps)
 
     def make(start):
@@ -84,6 +90,27 @@ def test_a_program_is_told_what_sensors_read_and_where_to_fly():
         assert not order.stands
     times = np.diff([reading.time for reading, _ in made[0].seen])
     assert times == pytest.approx(1 / RATE)
+
+
+def test_errors_of_gps_are_the_pilot_s_and_no_error_of_the_goal():
+    made = []
+    gps = {"noise": 0.2, "vertical_noise": 0.2, "velocity_noise": 0.1}
+    (flight,), _ = flown(made, steps=200, sensors={"gps": gps})
+    errors = []
+    for step, (reading, order) in enumerate(made[0].seen[-len(flight) :]):
+        told = made[0].told[step - len(flight)]
+        away = reading.position - flight.telemetry["position"][step]
+        faster = reading.velocity - flight.telemetry["velocity"][step]
+        errors.append((*away, *faster))
+        assert order.goal == pytest.approx(made[0].seen[-1][1].goal, abs=1e-4)
+        turned = math.cos(order.heading), math.sin(order.heading)
+        x, y, z = order.goal - reading.position
+        c, s = turned
+        assert told[:3] == pytest.approx([c * x + s * y, c * y - s * x, z], abs=1e-5)
+        x, y, z = reading.velocity
+        assert told[3:6] == pytest.approx([c * x + s * y, c * y - s * x, z], abs=1e-5)
+    spread = np.std(errors, axis=0)
+    assert spread == pytest.approx([0.2] * 3 + [0.1] * 3, rel=0.2)
 
 
 def test_it_stands_as_it_starts_until_the_rotors_carry_it():
