@@ -1,7 +1,6 @@
 """Betaflight in the seat: its program, in lock-step or in real time, flown by sticks."""
 
 import math
-import shutil
 import subprocess
 from pathlib import Path
 from typing import Final
@@ -11,7 +10,7 @@ import numpy as np
 from ..agents.policies import Observation
 from ..models import InputError, Vehicle
 from ..sim.control.gains import Gains
-from .programs import HOST, Program
+from .programs import Program, compiled
 from .protocol import betaflight as protocol
 from .reading import Floats, Order, Propellers, Reading
 from .seat import Start
@@ -113,9 +112,11 @@ class Betaflight:
             self._ordered = min(self._ordered, reading.time)
         if self._steps % self._sticks_every == 0:
             self._move_sticks(reading, order, observation)
-            self._send(protocol.sticks_packet(reading.time, self._channels), protocol.STICKS_PORT)
+            self._program.send(
+                protocol.sticks_packet(reading.time, self._channels), protocol.STICKS_PORT
+            )
         self._steps += 1
-        self._send(protocol.state_packet(reading, self._dialect), protocol.STATE_PORT)
+        self._program.send(protocol.state_packet(reading, self._dialect), protocol.STATE_PORT)
         throttles = np.zeros(len(self._order))
         throttles[self._order] = protocol.throttles(self._program.receive())
         return throttles
@@ -139,9 +140,6 @@ class Betaflight:
             1500.0 - 500.0 * math.degrees(yaw_rate) / FULL_RATE,
         )
 
-    def _send(self, datagram: bytes, port: int) -> None:
-        self._program.link.sendto(datagram, (HOST, port))
-
     def close(self) -> None:
         """As `Stack.close`."""
         self._program.close()
@@ -157,14 +155,3 @@ def motor_order(vehicle: Vehicle, motors: tuple[tuple[int, int], ...]) -> list[i
             f"got {vehicle.name} with rotors at {found}"
         )
     return [found.index(motor) for motor in motors]
-
-
-def compiled(source: Path, folder: Path) -> Path:
-    """A shared library of a C file, in a folder. Raises `InputError`."""
-    compiler = shutil.which("cc") or shutil.which("gcc")
-    if compiler is None:
-        raise InputError("autopilot: expected a C compiler for lock-step, got none: install gcc")
-    library = folder / f"{source.stem}.so"
-    words = (compiler, "-O2", "-shared", "-fPIC", "-o", library, source, "-ldl", "-lpthread")
-    subprocess.run(words, check=True)
-    return library

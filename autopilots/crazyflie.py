@@ -1,16 +1,19 @@
-"""The Crazyflie's firmware in the seat: its program (SITL), in lock-step."""
+"""The Crazyflie's firmware in the seat: its program (SITL), in lock-step or in real time."""
 
+import math
 import time
+from pathlib import Path
 from typing import Final
 
 import numpy as np
 
 from ..agents.policies import Observation
-from ..models import InputError
+from ..models import InputError, Vehicle
+from ..udp.protocol.errors import PeerSilent
 from . import find_stack
-from .programs import ANSWER, HOST, Program
+from .programs import ANSWER, HOST, Program, compiled
 from .protocol import crazyflie as protocol
-from .reading import Floats, Order, Reading
+from .reading import Floats, Order, Propellers, Reading
 from .seat import Start
 
 BOOT: Final = 4.0
@@ -18,75 +21,138 @@ BOOT: Final = 4.0
 POSE_EVERY: Final = 10
 """Steps between two poses, as motion capture gives them at 100 Hz."""
 GOAL_EVERY: Final = 20
-LOCKSTEP_PORT: Final = 19960
+_CORNERS: Final = [[1, -1], [-1, -1], [-1, 1], [1, 1]]
+"""Signs of x and y of its motors."""
+_FULL: Final = 65535.0
+_SHORTEST: Final = 1e-5  # s
+_SOURCE: Final = Path(__file__).with_name("crazyflie_lockstep.c")
+
+
+def parameters(vehicle: Vehicle, propellers: Propellers) -> list[bytes]:
+    """Packets that tell the firmware mass, arm, curve and hover throttle of a vehicle."""
+    hover = propellers.hover * _FULL
+    curve = vehicle.coefficients["rotors.curve"] or (0.0, 0.0, 1.0)
+    _, linear, square = vehicle.thrust_high[0] * np.array(curve)
+    return [
+        protocol.parameter_packet("posCtlPid", "thrustBase", "H", round(hover)),
+        protocol.parameter_packet("ctrlMel", "mass", "f", vehicle.mass),
+        protocol.parameter_packet(
+            "ctrlMel", "massThrust", "f", hover / (vehicle.mass * protocol.G)
+        ),
+        protocol.parameter_packet(
+            "quadSysId", "armLength", "f", math.hypot(*vehicle.rotors[0].position[:2])
+        ),
+        protocol.parameter_packet("quadSysId", "pwmToThrustA", "f", square),
+        protocol.parameter_packet("quadSysId", "pwmToThrustB", "f", linear),
+    ]
+
+
+class Client:
+    """A socket where a user's program, such as one with cflib, may talk to the firmware."""
+
+    def __init__(self, program: Program, port: int) -> None:
+        self._link = program.listen(port)
+        self._link.setblocking(False)
+        self._there: tuple[str, int] | None = None
+
+    def take(self) -> bytes | None:
+        """The next packet for the firmware."""
+        try:
+            packet, self._there = self._link.recvfrom(64)
+        except (BlockingIOError, ConnectionError):
+            return None
+        if packet[:1] == protocol.NOTHING:
+            self.give(protocol.NOTHING)
+            return None
+        return None if protocol.is_simulated(packet) else packet
+
+    def give(self, packet: bytes) -> None:
+        """Send what the firmware said, if there is a client."""
+        if self._there is not None:
+            self._link.sendto(packet, self._there)
 
 
 class Crazyflie:
-    """A program of the firmware whose clock goes on by 1 ms for each datagram to its lock-step
-    port, which it sends back when all tasks wait.
+    """A program of the firmware, with a port for another client of it.
+
+    In lock-step its clock goes on by 1 ms for each reading of the IMU; it answers with its motors
+    or, without any, with an empty datagram. In real time it keeps its own clock.
     """
 
     def __init__(self, start: Start) -> None:
-        _, vehicle, mode, program, _ = start
-        if vehicle.num_rotors != 4:
-            raise InputError(f"crazyflie: expected a quadcopter, got {vehicle.name}")
-        self._controller = find_stack("crazyflie").modes.index(mode)
+        config, vehicle, mode, program, self._real_time = start
+        corners = [np.sign(rotor.position[:2]).tolist() for rotor in vehicle.rotors]
+        if corners != _CORNERS:
+            raise InputError(
+                "crazyflie: expected four rotors, clockwise from the front right, "
+                f"got {vehicle.name} with rotors at {corners}"
+            )
+        self._parameters = parameters(vehicle, Propellers(config, vehicle))
+        controller = find_stack("crazyflie").modes.index(mode)
+        if controller:
+            packet = protocol.parameter_packet("stabilizer", "controller", "B", controller)
+            self._parameters.append(packet)
         self._steps = 0
         self._throttles = np.zeros(4)
         self.ready = False
         self.why = "the firmware gives no thrust"
         self.late = 0
-        self._program = Program("crazyflie", protocol.PORT, (LOCKSTEP_PORT,))
-        self._link = self._program.link
-        self._clock = self._program.listen(0)
-        words = [str(protocol.PORT), HOST]
-        self._program.start(program, words, {"CF_LOCKSTEP_PORT": str(LOCKSTEP_PORT)})
-        self._link.settimeout(ANSWER)
-        hello, self._there = self._link.recvfrom(64)
+        self._program = Program("crazyflie", protocol.PORT, (protocol.CLIENT_PORT,), apart=1)
+        number = self._program.number
+        self._client = Client(self._program, protocol.CLIENT_PORT + number)
+        environment = {}
+        if not self._real_time:
+            environment["LD_PRELOAD"] = str(compiled(_SOURCE, self._program.folder))
+        self._program.start(program, [str(protocol.PORT + number), HOST], environment)
+        hello = self._program.receive()
         if hello != protocol.HELLO:
             raise InputError(f"crazyflie: expected its greeting, got {hello.hex()}")
-        self._send(protocol.HELLO)
-        self._link.setblocking(False)
-        self._clock.connect((HOST, LOCKSTEP_PORT))
+        self._program.send(protocol.HELLO)
+        self._due = self._heard = time.monotonic()
 
     def step(self, reading: Reading, order: Order | None, observation: Observation) -> Floats:
         """As `Stack.step`."""
         self.ready = reading.time >= BOOT
         if self._steps % POSE_EVERY == 0:
-            self._send(protocol.pose_packet(reading))
+            self._program.send(protocol.pose_packet(reading))
         if order is not None and self._steps % GOAL_EVERY == 0:
-            self._send(protocol.goal_packet(order))
-        if self._steps == round(BOOT * protocol.RATE) and self._controller:
-            packet = protocol.parameter_packet("stabilizer", "controller", self._controller)
-            self._send(packet)
-        self._send(protocol.imu_packet(reading))
-        self._tick()
+            self._program.send(protocol.goal_packet(order))
+        elif self.ready and self._parameters:
+            self._program.send(self._parameters.pop())
+        elif packet := self._client.take():
+            self._program.send(packet)
+        self._program.send(protocol.imu_packet(reading))
         self._steps += 1
+        self._due = max(self._due + 1.0 / protocol.RATE, time.monotonic())
+        answered = self._take_answers()
+        if self._real_time and not answered and order is not None and not order.stands:
+            self.late += 1
         return self._throttles
 
-    def _tick(self) -> None:
-        """Let its clock go on, and take what it sent meanwhile."""
-        deadline = time.monotonic() + ANSWER
-        while True:
-            try:
-                self._clock.send(b"tick")
-                self._program.receive(self._clock)
-                break
-            except ConnectionRefusedError:  # it does not listen yet
-                if time.monotonic() > deadline:
-                    raise
-                time.sleep(0.01)
-        while True:
-            try:
-                packet = self._link.recv(64)
-            except BlockingIOError:
-                return
+    def _take_answers(self) -> bool:
+        """Take what it sends in this step. Returns whether motors were in it."""
+        answered = False
+        while packet := self._receive():
             throttles = protocol.throttles(packet)
-            if throttles is not None:
-                self._throttles = throttles
+            if throttles is None:
+                self._client.give(packet)
+                continue
+            self._throttles = throttles
+            if not self._real_time:
+                return True
+            answered = True
+            self._heard = time.monotonic()
+        return answered
 
-    def _send(self, packet: bytes) -> None:
-        self._link.sendto(packet, self._there)
+    def _receive(self) -> bytes:
+        """Its next packet; an empty one where the step ends."""
+        now = time.monotonic()
+        if not self._real_time or now - self._heard > ANSWER:
+            return self._program.receive()
+        try:
+            return self._program.receive(wait=max(self._due - now, _SHORTEST))
+        except PeerSilent:
+            return b""
 
     def close(self) -> None:
         """As `Stack.close`."""

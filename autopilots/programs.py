@@ -8,7 +8,7 @@ import socket
 import subprocess
 import weakref
 from collections.abc import Mapping, Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -46,6 +46,7 @@ class Program:
         self.folder = Path(self._closing.enter_context(TemporaryDirectory(prefix="rotorgram-")))
         self._process: subprocess.Popen[bytes] | None = None
         self._waits = False  # for a program that the user starts
+        self._there: tuple[str, int] | None = None  # from where it sends
         for number in range(most if apart else 1):
             try:
                 self.link = self.listen(own + number * apart)
@@ -102,18 +103,25 @@ class Program:
         """
         where = where or self.link
         where.settimeout(None if self._waits else wait)
-        try:
-            datagram = where.recv(2048)
+        with suppress(TimeoutError, ConnectionRefusedError):
+            datagram, sender = where.recvfrom(2048)
+            if where is self.link and self._there is None:
+                self._there = sender
+                where.connect(sender)  # what others send is not heard from now on
             self._waits = False
             return datagram
-        except TimeoutError:
-            pass
         status = self._process.poll() if self._process else None
         if status is None:
             raise PeerSilent(f"{self.name}: expected an answer within {wait:g} s, got none")
         words = (self.folder / _LOG).read_text(errors="replace").strip().splitlines()
         said = words[-1] if words else "it said nothing"
         raise PeerClosed(f"{self.name}: ended with status {status}: {said}")
+
+    def send(self, datagram: bytes, port: int | None = None) -> None:
+        """Send to a port of it; unless told otherwise to that from which it sent first."""
+        assert self._there is not None
+        with suppress(ConnectionRefusedError):  # it has ended: `receive` says so
+            self.link.sendto(datagram, (HOST, port) if port else self._there)
 
     def close(self) -> None:
         """End it. It may be called again."""
@@ -140,3 +148,14 @@ def _stop(process: subprocess.Popen[bytes]) -> None:
     except subprocess.TimeoutExpired:
         process.kill()
         process.wait()
+
+
+def compiled(source: Path, folder: Path) -> Path:
+    """A shared library of a C file, in a folder. Raises `InputError`."""
+    compiler = shutil.which("cc") or shutil.which("gcc")
+    if compiler is None:
+        raise InputError("autopilot: expected a C compiler for lock-step, got none: install gcc")
+    library = folder / f"{source.stem}.so"
+    words = (compiler, "-O2", "-shared", "-fPIC", "-o", library, source, "-ldl", "-lpthread")
+    subprocess.run(words, check=True)
+    return library

@@ -13,12 +13,17 @@ from ..reading import Order, Reading
 
 PORT: Final = 19950
 """Of the simulator."""
+CLIENT_PORT: Final = 19850
+"""Where clients such as cflib look for a Crazyflie."""
 RATE: Final = 1000.0
 """Of IMU readings and motors, Hz."""
 HELLO: Final = b"\xf3"
 """The firmware's first packet, and the answer."""
+NOTHING: Final = b"\xff"
+"""A packet without content, by which clients find and hold a link."""
+G: Final = 9.81
+"""Of the firmware, m/s²."""
 
-_G = 9.81  # m/s², of the firmware
 _PER_G = 2048.0
 _PER_DEGREE = 16.384  # per °/s
 _IMU = struct.Struct("<BB6h")
@@ -26,14 +31,16 @@ _POSE = struct.Struct("<BB7f")
 _GOAL = struct.Struct("<BB4f")
 _MOTORS = struct.Struct("<4H")
 _MOTORS_HEADER = 0x90
+_KINDS = {"B": 0x08, "H": 0x09, "f": 0x06}
 
 
 def imu_packet(reading: Reading) -> bytes:
     """Accelerometer and gyro."""
-    forces = reading.specific_force / _G * _PER_G
+    forces = reading.specific_force / G * _PER_G
     rates = np.degrees(reading.rates) * _PER_DEGREE
-    numbers = np.clip(np.rint(np.concatenate((forces, rates))), -32768, 32767)
-    return _IMU.pack(0x90, 0, *numbers.astype(int).tolist())
+    numbers = np.concatenate((forces, rates)).tolist()
+    whole = [round(min(max(number, -32768.0), 32767.0)) for number in numbers]
+    return _IMU.pack(0x90, 0, *whole)
 
 
 def pose_packet(reading: Reading) -> bytes:
@@ -47,14 +54,19 @@ def goal_packet(order: Order) -> bytes:
     return _GOAL.pack(0x70, 7, *order.goal.tolist(), np.degrees(order.heading))
 
 
-def parameter_packet(group: str, name: str, value: int) -> bytes:
-    """Set a parameter, uint8, by its name."""
+def parameter_packet(group: str, name: str, kind: str, value: float) -> bytes:
+    """Set a parameter by its name, of a kind of `struct`: B, H or f."""
     words = f"{group}\0{name}\0".encode()
-    return b"\x23\x00" + words + bytes((0x08, value))
+    return b"\x23\x00" + words + struct.pack(f"<B{kind}", _KINDS[kind], value)
+
+
+def is_simulated(packet: bytes) -> bool:
+    """Whether it is of the port of sensors and motors, which belongs to the simulator."""
+    return len(packet) > 0 and packet[0] & 0xF0 == _MOTORS_HEADER
 
 
 def throttles(packet: bytes) -> NDArray[np.float64] | None:
     """Of motors 1 to 4, from 0 to 1; None of another packet."""
-    if len(packet) != 1 + _MOTORS.size or packet[0] & 0xF0 != _MOTORS_HEADER:
+    if len(packet) != 1 + _MOTORS.size or not is_simulated(packet):
         return None
     return np.array(_MOTORS.unpack(packet[1:])) / 65535.0

@@ -21,6 +21,8 @@ mine = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
 mine.sendto(os.getcwd().encode(), ("127.0.0.1", int(sys.argv[1])))
 while True:
     data, there = mine.recvfrom(100)
+    if data == b"end":
+        os.kill(os.getpid(), 9)
     mine.sendto(data, there)
 """
 
@@ -150,4 +152,30 @@ def test_a_program_of_the_user_is_told_how_and_waited_for(capsys):
         own.kill()
     with pytest.raises(PeerSilent, match=r"expected an answer within 0\.1 s"):
         program.receive(wait=0.1)
+    program.close()
+
+
+def test_only_the_program_is_heard():
+    program = started(ECHO)
+    program.receive()
+    here = program.link.getsockname()
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
+        for number in range(1000):
+            other.sendto(f"hostile {number}".encode(), here)
+        program.send(b"hello")
+        assert program.receive() == b"hello"
+    with pytest.raises(PeerSilent):
+        program.receive(wait=0.1)
+    program.close()
+
+
+def test_one_that_is_killed_is_named():
+    program = started(ECHO)
+    program.receive()
+    program.send(b"end")
+    for _ in range(3):
+        time.sleep(0.05)
+        program.send(b"hello")
+    with pytest.raises(PeerClosed, match=r"^echo: ended with status -9: it said nothing$"):
+        program.receive(wait=1.0)
     program.close()
