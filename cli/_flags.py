@@ -169,6 +169,14 @@ class WireFlags(EnvFlags):
     """MCAP file to write every message to."""
 
 
+class MavlinkFlags(Command):
+    """A command that flies, or shows a flight."""
+
+    mavlink: Annotated[str | None, arg(metavar="udp:HOST:PORT")] = None
+    """Send the flight of the first world there as MAVLink, for a ground station:
+    udp:127.0.0.1:14550."""
+
+
 class AgentFlags(WireFlags):
     """A command that flies over the wire: the UDP server."""
 

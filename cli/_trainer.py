@@ -24,6 +24,7 @@ from ..training.settings import Run
 from ..training.training import Training, config_of, is_finished
 from ._env import CHECKPOINT, fitted, local_env, remote_env
 from ._flags import DEFAULT_ENV
+from ._mavlink import mavlink_out
 from ._progress import bars
 from ._scalars import ScalarWriter
 from ._training import flags_of, folder_to_write
@@ -33,7 +34,7 @@ if TYPE_CHECKING:
 
 EPISODES = "episodes.csv"
 _WIRE = ("env", "vehicle", "udp", "listen", "num_simulators", "key_file", "insecure")
-_FREE = (*_WIRE, "record", "store_every", "env_steps")
+_FREE = (*_WIRE, "record", "mavlink", "store_every", "env_steps")
 """Flags that a resumed training may be given."""
 _IMPLY_UDP = ("listen", "num_simulators", "key_file", "insecure", "record")
 _OF_THE_PAPER = ("vpg", "a2c", "sb3-a2c")
@@ -141,7 +142,9 @@ def _train(command: "Train", training: Training, folder: Path) -> int:
     go_on = command.go_on_with(f"train {command.algorithm}", folder, *_WIRE)
     keeper = _Keeper(training, folder, command.store_every)
     try:
-        with _stop_at_update() as stop_is_asked, bars() as progress:
+        env = training.env
+        shown = mavlink_out(command, env.env_spec)
+        with _stop_at_update() as stop_is_asked, bars() as progress, shown as env.observer:
 
             def on_update() -> bool:
                 stopping = stop_is_asked()

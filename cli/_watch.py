@@ -4,7 +4,7 @@ import logging
 import time
 from collections.abc import Iterable
 from contextlib import ExitStack, closing
-from typing import cast
+from typing import TYPE_CHECKING, cast
 
 import numpy as np
 
@@ -19,6 +19,9 @@ from ..udp.protocol.messages import Command
 from ..udp.transport.simulator import Simulator
 from ._env import print_episode
 from ._flags import EnvFlags
+
+if TYPE_CHECKING:
+    from ..autopilots.mavlink import MavlinkOut
 
 _log = logging.getLogger(__name__)
 
@@ -69,8 +72,15 @@ def open_view(command: EnvFlags, drones: int, flown: SceneConfig, pace: Pace) ->
     return closing(LiveView(Stage(scene, drones, vehicle=command.vehicle), pace))
 
 
-def show(command: EnvFlags, flights: Iterable[Flights], speed: float = 1.0) -> None:
-    """Show flights in a window at a speed, one after the other, each of all drones of a world."""
+def show(
+    command: EnvFlags,
+    flights: Iterable[Flights],
+    speed: float = 1.0,
+    out: "MavlinkOut | None" = None,
+) -> None:
+    """Show flights in a window at a speed, one after the other, each of all drones of a world; with
+    the same pace as MAVLink.
+    """
     with ExitStack() as opened:
         scene = None
         for flight in flights:
@@ -84,7 +94,9 @@ def show(command: EnvFlags, flights: Iterable[Flights], speed: float = 1.0) -> N
             longest = max(map(len, shown))
             # A drone whose episode has ended stays as it ended.
             padded = [own + [own[-1]] * (longest - len(own)) for own in shown]
-            if not all(live.draw_in_time(*frame) for frame in zip(*padded, strict=True)):
+            frames = zip(*padded, strict=True)
+            drawn = frames if out is None else out.along(frames, flight)
+            if not all(live.draw_in_time(*frame) for frame in drawn):
                 break
             for one in flight:
                 print_episode(one)

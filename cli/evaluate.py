@@ -4,13 +4,13 @@ from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import Positional, arg
 
-from ._flags import AgentFlags, Count
+from ._flags import AgentFlags, Count, MavlinkFlags
 
 if TYPE_CHECKING:
     from ..flights.trajectories import Flights
 
 
-class Evaluate(AgentFlags):
+class Evaluate(AgentFlags, MavlinkFlags):
     """Measure a trained policy or a controller over episodes without exploration."""
 
     policy: Positional[Annotated[str, arg(metavar="POLICY")]]
@@ -23,13 +23,15 @@ class Evaluate(AgentFlags):
         from ..flights.trajectories import fly_episodes
         from ..training.metrics import Headline
         from ._env import fitted, in_unseen, load_pilot, policy_for, remote_env
+        from ._mavlink import mavlink_out
 
         checkpoint = load_pilot(self.policy)
         command = in_unseen(fitted(self, checkpoint))
         with remote_env(command, num_envs=command.drones) as env:
             Headline.of(env.env_spec)  # it names what is measured
             policy = policy_for(command, checkpoint, env.env_spec)
-            trajectories = fly_episodes(env, policy, self.episodes, "final")
+            with mavlink_out(self, env.env_spec) as env.observer:
+                trajectories = fly_episodes(env, policy, self.episodes, "final")
         print_means(self.policy, trajectories)
 
 

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from tyro.conf import Positional, arg
 
 from ..models import InputError
-from ._flags import Count, EnvFlags
+from ._flags import Count, EnvFlags, MavlinkFlags
 
 if TYPE_CHECKING:
     from ..autopilots.seat import Tally
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from ..flights.trajectories import Flights
 
 
-class Fly(EnvFlags):
+class Fly(EnvFlags, MavlinkFlags):
     """Fly a task by an autopilot: its program is started, armed, and told the goals.
 
     The craft stands at its start until the rotors carry it. Exit status 1 if a program failed.
@@ -54,6 +54,7 @@ class Fly(EnvFlags):
         from ..flights.filming import Film, FilmTrack, film
         from ..flights.trajectories import fly_episodes
         from ..rendering.film import check_film
+        from ._mavlink import mavlink_out
 
         settings = Film(scene=self.shown_scene, vehicle=self.vehicle)
         if self.film:
@@ -73,12 +74,13 @@ class Fly(EnvFlags):
         with self._opened(config) as env:
             seat = Seat(env.env_spec, start, stack.make)
             began = time.perf_counter()
-            if self.view:
-                from ._watch import show
+            with mavlink_out(self, env.env_spec) as env.observer:
+                if self.view:
+                    from ._watch import show
 
-                show(self, flights())
-            else:
-                deque(flights(), 0)
+                    show(self, flights())
+                else:
+                    deque(flights(), 0)
             taken = time.perf_counter() - began
         self._report(flown, seat.tally, seat.tally.steps / stack.rate / taken)
         if self.film:

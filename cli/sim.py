@@ -4,10 +4,10 @@ from contextlib import ExitStack
 from typing import Literal
 
 from ..models import InputError
-from ._flags import WireFlags, Words, parse_address
+from ._flags import MavlinkFlags, WireFlags, Words, parse_address
 
 
-class Sim(WireFlags):
+class Sim(WireFlags, MavlinkFlags):
     """Simulate drones for an agent: the UDP client.
 
     Waits for the agent, flies by its commands and ends when it closes. An agent that is killed and
@@ -39,6 +39,7 @@ class Sim(WireFlags):
 
             offscreen_context(16, 16).free()
         from ..udp import LinkConfig, Simulator
+        from ._mavlink import mavlink_out
 
         several = "agents" in self.given
         if several and "server" in self.given:
@@ -69,7 +70,11 @@ class Sim(WireFlags):
                     open_view(self, drones, self.env_config().scene, Pace(0.0))
                 )
                 print("shown in the window")
-                simulator.observer = Watcher(view, simulator)
+                simulator.observers.append(Watcher(view, simulator))
+            out = opened.enter_context(mavlink_out(self, simulator.spec))
+            if out is not None:
+                stepped = simulator.stepped
+                simulator.observers.append(lambda cause: out(stepped, cause.resets))
             here = "{}:{}".format(*simulator.address)
             print(f"simulating at {here} for {there} (Ctrl-C ends)")
             try:

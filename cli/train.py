@@ -6,11 +6,11 @@ from tyro.conf import Positional, arg
 
 from ..agents.registry import AlgorithmName
 from ..models.fields import Limits
-from ._flags import AgentFlags, BackendOfPreset
+from ._flags import AgentFlags, BackendOfPreset, MavlinkFlags
 from ._training import TrainingFlags
 
 
-class Train(AgentFlags, TrainingFlags):
+class Train(AgentFlags, TrainingFlags, MavlinkFlags):
     """Train an agent, in this process or over UDP.
 
     vpg, a2c and sb3-a2c learn Elevation-v0 over UDP, as in the paper. All agents do with --udp,

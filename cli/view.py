@@ -1,6 +1,6 @@
 """`rotorgram view`: flights live, flown in process or read from a journal."""
 
-from itertools import count, islice
+from itertools import chain, count, islice
 from pathlib import Path
 
 from tyro.conf import Positional
@@ -9,10 +9,10 @@ from ..flights.recorded import recorded_trajectories
 from ..flights.trajectories import flown_trajectories
 from ..models import InputError
 from ..scenes.returns import RANGES
-from ._flags import Count, EnvFlags
+from ._flags import Count, EnvFlags, MavlinkFlags
 
 
-class View(EnvFlags):
+class View(EnvFlags, MavlinkFlags):
     """Show flights in a window: in real time, slower or faster.
 
     Keys: space pauses, the arrow to the right takes one step.
@@ -29,6 +29,7 @@ class View(EnvFlags):
     def run(self) -> None:
         """Fly and show, episode after episode."""
         from ._env import pilot_of
+        from ._mavlink import mavlink_out
         from ._watch import show
 
         path = Path(self.what)
@@ -42,4 +43,7 @@ class View(EnvFlags):
             config = shown.env_config()
             flights = (flown_trajectories(policy, config, [one], "final") for one in count())
         print(f"showing {self.what} in the window (Ctrl-C ends)")
-        show(shown, islice(flights, self.episodes), self.speed)
+        first = next(flights)
+        chosen = islice(chain((first,), flights), self.episodes)
+        with mavlink_out(self, first[0].spec) as out:
+            show(shown, chosen, self.speed, out)

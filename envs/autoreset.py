@@ -25,6 +25,7 @@ Step = tuple[Observation, Array, Array, Array, Info]
 Content = tuple[Mapping[str, Array], Mapping[str, Array]]
 """Telemetry and terms of the reward by name, float64, shape (N, n) and (N,)."""
 Told = Callable[[], Content]
+Observer = Callable[["AdvancingVectorEnv", Array | None], None]
 Seeds = Sequence[int | None] | Array
 """A seed for each drone; None leaves its stream of random numbers as it is."""
 Seed = int | Seeds | None
@@ -59,6 +60,8 @@ class AdvancingVectorEnv(VectorEnv[Observation, ArrayLike, Array]):
     out: Array
     lost: Array
     telemetry: Mapping[str, Array]
+    observer: Observer | None = None
+    """Called after every `advance`, with the env and the drones that were reset."""
     _nothing: Array = np.zeros(1)  # actions, where nobody flies
 
     @property

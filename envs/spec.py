@@ -297,6 +297,13 @@ class EnvSpec(_Part):
             raise InputError(f"{user}: expected the constant {name!r} in the spec, got {value!r}")
         return value
 
+    def check_telemetry(self, names: Sequence[str], user: str) -> None:
+        """Raise `InputError`, which names the `user`, if these are not all in the telemetry."""
+        missing = set(names).difference(array.name for array in self.telemetry)
+        if missing:
+            wanted = ", ".join(sorted(missing))
+            raise InputError(f"{user}: expected telemetry of {wanted}, {self.env_id} has none")
+
     @property
     def action_scale(self) -> np.ndarray:
         """What 1 stands for in each number of an action, in its unit, float64, shape (k,)."""

@@ -113,6 +113,8 @@ class LocalVectorEnv(AdvancingVectorEnv, VectorEnv[Observation, ArrayLike, Array
         self._take_results()
         if self.render_mode == "human":
             self.render()
+        if self.observer is not None:
+            self.observer(self, resets)
 
     def snapshot(self) -> Snapshot:
         """Copies of all arrays that a later step depends on, by name."""

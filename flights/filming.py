@@ -34,20 +34,21 @@ def moments(trajectory: Trajectory) -> list[Moment]:
     They have readings of sensors with rays if those are among the observations. Raises `InputError`
     if its telemetry lacks position, attitude or thrust.
     """
-    telemetry = trajectory.telemetry
     spec = trajectory.spec
-    missing = {"position", "attitude", "thrust"} - set(telemetry)
-    if missing:
-        raise InputError(
-            f"pictures: expected telemetry of {', '.join(sorted(missing))}, {spec.env_id} has none"
-        )
+    spec.check_telemetry(("position", "attitude", "thrust"), "pictures")
     found = []
     for step, reward in enumerate([0.0, *trajectory.rewards.tolist()]):
-        row = {name: array[step] for name, array in telemetry.items()}
         readings = trajectory.readings(step)
         episode = trajectory.episode
         found.append(
-            moment(spec, row, step=step, reward=reward, episode=episode, readings=readings)
+            moment(
+                spec,
+                trajectory.row(step),
+                step=step,
+                reward=reward,
+                episode=episode,
+                readings=readings,
+            )
         )
     return found
 

@@ -82,6 +82,10 @@ class Trajectory:
     def __len__(self) -> int:
         return len(self.rewards)
 
+    def row(self, step: int) -> Mapping[str, Floats]:
+        """The telemetry after a step; from its end on that of the end."""
+        return {name: array[min(step, len(self))] for name, array in self.telemetry.items()}
+
     @property
     def seconds(self) -> float:
         """Duration, s."""
@@ -148,12 +152,7 @@ class Trajectory:
 
         Raises `InputError` where the telemetry has no position or attitude.
         """
-        for name in ("position", "attitude"):
-            if name not in self.telemetry:
-                raise InputError(
-                    f"{self.spec.env_id}: expected telemetry of the {name}, "
-                    f"got {', '.join(self.telemetry) or 'none'}"
-                )
+        self.spec.check_telemetry(("position", "attitude"), "pose")
         return np.concatenate((self.telemetry["position"], self.telemetry["attitude"]), axis=1)
 
     @property

@@ -143,7 +143,8 @@ def fly_eight(kills: int, dice: random.Random) -> dict[str, object]:
                 config=LinkConfig(timeout=600),
             )  # fmt: skip
             rules = simulator.rules
-            simulator.observer = twin = Twin(simulator)
+            twin = Twin(simulator)
+            simulator.observers.append(twin)
             thread = threading.Thread(target=simulator.run)
             thread.start()
             try:

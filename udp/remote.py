@@ -348,6 +348,8 @@ class RemoteVectorEnv(_Remote, AdvancingVectorEnv, VectorEnv[Observation, ArrayL
         self.done = worlds_done(self.out, len(self.env_spec.agents))
         self._idle = self._idle & ~resets
         self._flying = True
+        if self.observer is not None:
+            self.observer(self, resets)
 
     def _exchange(
         self,

@@ -4,7 +4,6 @@ Body axes are x forward, y right, z down; the world is x north, y east, z down.
 """
 
 import json
-import math
 import struct
 from typing import Final, NamedTuple
 
@@ -12,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...models import InputError
-from ...sim.rotations import axes_of
 from ..reading import Reading
+from .frames import angles_of, forward_right_down, north_east_down
 
 PORT: Final = 9002
 """Of the simulator."""
@@ -47,23 +46,14 @@ def servos(datagram: bytes) -> Servos:
 
 def state_line(reading: Reading) -> bytes:
     """What its sensors and its estimate begin from."""
-    (front_x, front_y, front_z), (*_, left_z), (*_, up_z) = axes_of(reading.quaternion)
-    turn = math.atan2(left_z, up_z), math.asin(min(max(front_z, -1.0), 1.0))
-    flip = np.array((1.0, -1.0, -1.0))
     state = {
         "timestamp": reading.time,
         "imu": {
-            "gyro": (flip * reading.rates).tolist(),
-            "accel_body": (flip * reading.specific_force).tolist(),
+            "gyro": forward_right_down(reading.rates),
+            "accel_body": forward_right_down(reading.specific_force),
         },
         "position": north_east_down(reading.position),
-        "attitude": [*turn, math.atan2(front_x, front_y)],
+        "attitude": angles_of(reading.quaternion),
         "velocity": north_east_down(reading.velocity),
     }
     return f"\n{json.dumps(state)}\n".encode()
-
-
-def north_east_down(vector: NDArray[np.float64]) -> list[float]:
-    """Of x east, y north, z up."""
-    x, y, z = vector.tolist()
-    return [y, x, -z]

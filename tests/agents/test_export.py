@@ -527,7 +527,7 @@ def flown_by_c(header: Path, seed: int) -> np.ndarray:
     with running([str(program)], 0, 1, seed) as agent:
         env_id = "rotorgram/Elevation-v0"
         simulator = Simulator(env_id, server=waiting(agent), bind=ANY, codec="text")
-        simulator.observer = observe
+        simulator.observers.append(observe)
         flight = Running(simulator)
         status, out, err = ended(agent)
         assert err == ""

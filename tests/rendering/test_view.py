@@ -267,7 +267,7 @@ def test_a_watched_simulator_flies_the_same_bits_and_does_not_wait(stage: Stage)
     with RemoteEnv(("127.0.0.1", 0), connect=False, connect_timeout=20) as env:
         simulator = Simulator(server=env.address, bind=("127.0.0.1", 0))
         with simulator, fake_view(stage, busy=True) as (live, surface):
-            simulator.observer = Watcher(live, simulator)
+            simulator.observers.append(Watcher(live, simulator))
             running = Running(simulator)
             # The surface is busy with its first picture until all of this is flown.
             assert flown(env, 600) == expected

@@ -222,7 +222,7 @@ def test_drones_of_one_that_is_killed_hold_and_it_comes_back() -> None:
             if not cause.resets.any() and rules.links[1].participation != "flying":
                 lost.append((rules.episodes, rules.steps))
 
-        running.simulator.observer = watch
+        running.simulator.observers.append(watch)
         for thread in others:
             thread.start()
         heard(victim, "20")

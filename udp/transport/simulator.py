@@ -40,7 +40,7 @@ DEFAULT_SIMULATOR = ("127.0.0.1", 8000)
 _ALIVE_EVERY = 0.5  # period of the message Alive while an agent waits for a State, s
 
 Observer = Callable[[Command], None]
-"""Called with the Command that moved the drones: see `Simulator.observer`."""
+"""Called with the Command that moved the drones: see `Simulator.observers`."""
 
 
 class Simulator(NotCopied):
@@ -71,7 +71,7 @@ class Simulator(NotCopied):
         spec: Spec of the env.
         stepped: The loop or the envs.
         rules: What the world does with the messages of its agents.
-        observer: Called after every step of the world, once the agents have its State.
+        observers: Called after every step of the world, once the agents have its State.
 
     Raises:
         InputError: An option, an address, the key file or the env's spaces are not what they
@@ -79,7 +79,6 @@ class Simulator(NotCopied):
         OSError: The port is in use, or the record cannot be written.
     """
 
-    observer: Observer | None = None
     _stopped = _ran = False
     _journal: "Journal | None" = None
 
@@ -123,6 +122,7 @@ class Simulator(NotCopied):
             self._by_address = {link.address: link for link in links}
             if len(self._by_address) < len(links):
                 raise InputError(f"agents: expected a different address of each, got {servers}")
+            self.observers: list[Observer] = []
             self._port = port = Port(bind, insecure=insecure, peers=tuple(self._by_address))
             failing.callback(port.close)
             self.address: Address = port.address
@@ -207,8 +207,8 @@ class Simulator(NotCopied):
             self._flush()
             if cause := rules.cause:
                 rules.cause = None
-                if self.observer is not None:
-                    self.observer(cause)
+                for observe in self.observers:
+                    observe(cause)
                 if self._journal:
                     self._journal.write()
             if rules.reason is not None:
