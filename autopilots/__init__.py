@@ -8,6 +8,7 @@ from ..models.errors import InputError
 
 if TYPE_CHECKING:
     from .seat import Stack, Start
+    from .sticks import Pilot
 
 
 class StackInfo(NamedTuple):
@@ -28,12 +29,12 @@ class StackInfo(NamedTuple):
             raise InputError(f"mode: expected {expected} with {self.name}, got {mode}")
         return mode or self.modes[0]
 
-    def make(self, start: "Start") -> "Stack":
-        """Begin one. Raises `InputError` where that fails."""
-        kind: Callable[[Start], Stack] = getattr(
-            import_module(f".{self.name}", __name__), self.kind
-        )
-        return kind(start)
+    def make(self, start: "Start", **pilot: "Pilot") -> "Stack":
+        """Begin one, flown by a pilot of ours if it takes one. Raises `InputError` where that
+        fails.
+        """
+        kind: Callable[..., Stack] = getattr(import_module(f".{self.name}", __name__), self.kind)
+        return kind(start, **pilot)
 
 
 STACKS: Final[Mapping[str, StackInfo]] = {

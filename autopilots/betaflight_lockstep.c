@@ -5,6 +5,9 @@
  * came. There the library sends the motors once, and the thread waits for the next state. So the
  * program computes as much as between two states of a real flight, however long that takes.
  *
+ * BETAFLIGHT_LOCKSTEP in the environment switches that on. BETAFLIGHT_APART is added to all ports,
+ * so that several programs run side by side.
+ *
  * States come in a thread, sticks in another. Sticks that were sent before a state are taken over
  * before the clock goes on. In what the program reads, the stamp is constant: its own measurement
  * of the simulator's speed stays at 1.
@@ -24,8 +27,10 @@
 #include <time.h>
 #include <unistd.h>
 
-enum { MOTORS = 9002, STICKS = 9004, STATE_SIZE = 18 * 8, MOTORS_SIZE = 64 };
+enum { MOTORS = 9001, STICKS = 9004, STATE_SIZE = 18 * 8, MOTORS_SIZE = 68 };
 static const int64_t SECOND = 1000000000, BOOT = 2000000000, TICK = 1000; /* ns */
+
+static int lockstep, apart;
 
 static pthread_mutex_t lock = PTHREAD_MUTEX_INITIALIZER;
 static pthread_cond_t more_time = PTHREAD_COND_INITIALIZER;
@@ -37,7 +42,6 @@ static int64_t first_end;
 static int motors_socket = -1, sticks_socket = -1;
 static struct sockaddr_in motors_to;
 static char motors[MOTORS_SIZE];
-static size_t motors_size = 16;
 
 static volatile int sticks_are_read;
 static __thread int reads_sticks;
@@ -50,6 +54,9 @@ __attribute__((constructor)) static void begin(void)
 {
     send_on = dlsym(RTLD_NEXT, "sendto");
     receive = dlsym(RTLD_NEXT, "recvfrom");
+    lockstep = getenv("BETAFLIGHT_LOCKSTEP") != NULL;
+    const char *given = getenv("BETAFLIGHT_APART");
+    apart = given ? atoi(given) : 0;
     shown = now;
     end = now + BOOT;
 }
@@ -67,7 +74,7 @@ static void answer_and_wait(void)
     pthread_mutex_lock(&lock);
     int64_t before = end;
     if (motors_socket >= 0)
-        send_on(motors_socket, motors, motors_size, 0, (struct sockaddr *)&motors_to, sizeof motors_to);
+        send_on(motors_socket, motors, sizeof motors, 0, (struct sockaddr *)&motors_to, sizeof motors_to);
     while (end == before)
         pthread_cond_wait(&more_time, &lock);
     pthread_mutex_unlock(&lock);
@@ -101,7 +108,7 @@ static void go_on_to(double to)
 
 int clock_gettime(clockid_t clock, struct timespec *time)
 {
-    if (clock != CLOCK_MONOTONIC)
+    if (!lockstep || clock != CLOCK_MONOTONIC)
         return (int)syscall(SYS_clock_gettime, clock, time);
     int mine = is_main();
     if (mine)
@@ -114,41 +121,52 @@ int clock_gettime(clockid_t clock, struct timespec *time)
 
 int nanosleep(const struct timespec *time, struct timespec *left)
 {
-    if (!is_main())
+    if (!lockstep || !is_main())
         return (int)syscall(SYS_nanosleep, time, left);
     spend(time->tv_sec * SECOND + time->tv_nsec);
     return 0;
 }
 
+/* The port of an address; 0 of other families. The address in `moved` has it `apart` higher. */
+static int port_of(const struct sockaddr *address, socklen_t size, struct sockaddr_in *moved)
+{
+    if (!address || address->sa_family != AF_INET || size != sizeof *moved)
+        return 0;
+    memcpy(moved, address, sizeof *moved);
+    int port = ntohs(moved->sin_port);
+    moved->sin_port = htons(port + apart);
+    return port;
+}
+
 int bind(int socket, const struct sockaddr *address, socklen_t size)
 {
-    const struct sockaddr_in *to = (const void *)address;
-    if (to->sin_family == AF_INET && ntohs(to->sin_port) == STICKS)
+    struct sockaddr_in moved;
+    int port = port_of(address, size, &moved);
+    if (port == STICKS)
         sticks_socket = socket;
-    return (int)syscall(SYS_bind, socket, address, size);
+    return (int)syscall(SYS_bind, socket, port ? (const void *)&moved : address, size);
 }
 
 ssize_t sendto(int socket, const void *data, size_t size, int flags, const struct sockaddr *address, socklen_t length)
 {
-    const struct sockaddr_in *to = (const void *)address;
-    int are_motors = to && to->sin_family == AF_INET && ntohs(to->sin_port) == MOTORS;
-    if (!are_motors || size > MOTORS_SIZE)
-        return send_on(socket, data, size, flags, address, length);
+    struct sockaddr_in moved;
+    int port = port_of(address, length, &moved);
+    if (!lockstep || port != MOTORS || size != MOTORS_SIZE)
+        return send_on(socket, data, size, flags, port ? (const void *)&moved : address, length);
     pthread_mutex_lock(&lock);
     memcpy(motors, data, size);
-    motors_size = size;
     motors_socket = socket;
-    motors_to = *to;
+    motors_to = moved;
     pthread_mutex_unlock(&lock);
     return (ssize_t)size;
 }
 
 ssize_t recvfrom(int socket, void *data, size_t size, int flags, struct sockaddr *from, socklen_t *length)
 {
-    if (socket == sticks_socket)
+    if (lockstep && socket == sticks_socket)
         reads_sticks = sticks_are_read = 1;
     ssize_t got = receive(socket, data, size, flags, from, length);
-    if (got == STATE_SIZE && socket != sticks_socket) {
+    if (lockstep && got == STATE_SIZE && socket != sticks_socket) {
         const double constant = 1.0;
         memcpy(&stamp, data, sizeof stamp);
         memcpy(data, &constant, sizeof constant);

@@ -1,61 +1,114 @@
-"""Sticks of a remote control from a goal: the loops of the level `position`, down to the attitude.
+"""Sticks of a remote control: what a policy asks for, down to the attitude or the body rates.
 
-`geometric` asks for an offset and a heading; the loops turn them into a collective thrust, roll,
-pitch and a yaw rate, which a flight controller takes as sticks.
+The policy is one of ours, of a level from `rates` to `position`. Without one, `geometric` flies to
+the goal. The loops of the level turn its action into what a flight controller takes as sticks.
 """
 
+import copy
 import math
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from ..agents.geometric import Geometric
-from ..agents.policies import Observation
+from ..agents.policies import Observation, Policy
 from ..envs.config import EnvConfig
 from ..envs.registry import env_spec
-from ..models import Vehicle
-from ..sim.control.cascade import Position
+from ..envs.spec import EnvSpec
+from ..models import InputError, Vehicle
+from ..sim.control import make_controller
+from ..sim.control.cascade import Position, Rates
 from ..sim.control.gains import Gains
 from ..sim.effects import NO_EFFECTS
-from ..sim.rotations import Parts, Rows
+from ..sim.rotations import Parts, Rows, axes_of
 from ..sim.state import Array
 from .reading import Floats, Reading
 
 PERIOD = 0.01
-"""Time between two positions of the sticks, s."""
+"""Time between two positions of the sticks without a policy, s."""
 LAG = 0.02
-"""With which a flight controller is taken to follow them, s."""
+"""Lag with which a flight controller is taken to follow them, s."""
 
 
-class Demands(Position):
-    """The level `position` that ends at the attitude: N, rad, rad, rad/s."""
+class Pilot(NamedTuple):
+    """A policy of ours that moves the sticks."""
 
-    def point(
-        self, collective: Array, axis: Parts, yaw_rate: Array, axes: Rows, state: Any
-    ) -> Array:
-        """Collective thrust, roll, pitch, yaw rate; as of the level `attitude`."""
-        x, y, z = axis
-        nose_x, nose_y, _ = axes[0]
-        length = math.hypot(nose_x, nose_y)
-        ahead = (nose_x * x + nose_y * y) / length
-        left = (nose_x * y - nose_y * x) / length
-        roll = -math.asin(max(-1.0, min(left, 1.0)))
-        return np.array((collective, roll, math.atan2(ahead, z), yaw_rate))
+    policy: Policy
+    spec: EnvSpec
+    """Of the env that it was trained in."""
 
 
 class StickPilot:
-    """Flies to the goal of a task by what sticks ask for."""
+    """What a pilot asks for with its sticks: an attitude, or body rates where it is `acro`.
 
-    def __init__(self, config: EnvConfig, vehicle: Vehicle) -> None:
-        position = config.changed(action="position", control_period=PERIOD)
-        self._pilot = Geometric(env_spec(position))
-        lag = vehicle.coefficients["rotors.time_constant"] or 0.0
-        self._demands = Demands(vehicle, Gains.of(vehicle, PERIOD, max(lag, LAG)), NO_EFFECTS)
+    Attributes:
+        period: Time between two positions of the sticks, s.
+        acro: Whether its demands are body rates; always so with a policy of the level `rates`.
+        gains: Of its loops.
+    """
+
+    def __init__(
+        self, config: EnvConfig, vehicle: Vehicle, pilot: Pilot | None, acro: bool
+    ) -> None:
+        """Raises `InputError` for a policy that cannot fly so."""
+        level = "position"
+        if pilot is None:
+            spec = env_spec(config.changed(action=level, control_period=PERIOD))
+            lag = vehicle.coefficients["rotors.time_constant"] or 0.0
+            gains = Gains.of(vehicle, PERIOD, max(lag, LAG))
+            loops: Rates = Position(vehicle, gains, NO_EFFECTS)
+            self._policy: Policy = Geometric(spec)
+        else:
+            spec = pilot.spec
+            level = str(spec.options["action"])
+            controller = make_controller(level, vehicle, vehicle.timestep, config.effects)
+            seen = env_spec(config).observation
+            if not isinstance(controller, Rates) or not set(spec.observation) <= set(seen):
+                raise InputError(
+                    "policy: expected one of the levels rates, attitude, velocity or position "
+                    f"that observes no more than {spec.env_id} at {1.0 / PERIOD:g}, got {level}"
+                )
+            loops = controller
+            self._policy = copy.deepcopy(pilot.policy)
+        self._policy.reset()
+        self.period = spec.control_period
+        self.acro = acro or level == "rates"
+        self.gains = loops.gains
+        self._loops = loops
+        if self.acro:
+            vars(loops)["turn"] = _rates
+        else:
+            vars(loops)["point"] = _attitude
+
+    def held(self, weight: float, reading: Reading) -> Floats:
+        """Demands of a craft on its stand, so that no loop winds up there."""
+        if self.acro:
+            return np.array((weight, 0.0, 0.0, 0.0))
+        axes = axes_of(reading.quaternion)
+        held: Floats = _attitude(weight, axes[2], 0.0, axes, None)
+        return held
 
     def demands(self, reading: Reading, observation: Observation) -> Floats:
-        """Collective thrust, N, roll and pitch, rad, and yaw rate, rad/s, shape (4,)."""
-        action = self._pilot.act(observation).astype(np.float64)
+        """Collective thrust, N, with roll and pitch, rad, and yaw rate, rad/s, or with body rates,
+        rad/s; shape (4,).
+        """
+        action = np.asarray(self._policy.act(observation), np.float64)
         state: Any = SimpleNamespace(quaternion=reading.quaternion, velocity=reading.velocity)
-        demands: Floats = self._demands.thrust(action, state)
+        demands: Floats = self._loops.thrust(action, state)
         return demands
+
+
+def _rates(collective: Array, rates: Parts, state: object) -> Array:
+    return np.array((collective, *rates))
+
+
+def _attitude(collective: Array, axis: Parts, yaw_rate: Array, axes: Rows, state: object) -> Array:
+    """Collective thrust, roll, pitch, yaw rate; as of the level `attitude`."""
+    x, y, z = axis
+    nose_x, nose_y, _ = axes[0]
+    length = math.hypot(nose_x, nose_y)
+    ahead = (nose_x * x + nose_y * y) / length
+    left = (nose_x * y - nose_y * x) / length
+    roll = -math.asin(max(-1.0, min(left, 1.0)))
+    return np.array((collective, roll, math.atan2(ahead, z), yaw_rate))

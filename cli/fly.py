@@ -4,6 +4,7 @@ import time
 from collections import deque
 from collections.abc import Iterator
 from contextlib import AbstractContextManager, closing
+from functools import partial
 from hashlib import blake2b
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -14,7 +15,8 @@ from ..models import InputError
 from ._flags import Count, EnvFlags, MavlinkFlags
 
 if TYPE_CHECKING:
-    from ..autopilots.seat import Tally
+    from ..autopilots import StackInfo
+    from ..autopilots.seat import MakeStack, Tally
     from ..envs.config import EnvConfig
     from ..flights.trajectories import Flights
 
@@ -36,6 +38,9 @@ class Fly(EnvFlags, MavlinkFlags):
     """Wait for a program that you start: the command is printed."""
     mode: Annotated[str | None, arg(metavar="MODE")] = None
     """How it flies: guided or auto; angle or acro; auto, pid, mellinger, indi or brescianini."""
+    policy: Annotated[str | None, arg(metavar="POLICY")] = None
+    """What moves Betaflight's sticks in place of our loops: a checkpoint, the folder of a training,
+    or a controller."""
     real_time: bool = False
     """Let the program keep its own clock. Late steps are counted."""
     seeds: Count = 1
@@ -61,7 +66,8 @@ class Fly(EnvFlags, MavlinkFlags):
             check_film(self.film, settings.width, settings.height, settings.fps)
         stack = find_stack(self.autopilot)
         mode = stack.checked_mode(self.mode)
-        config = seated(self.env_config(), stack.rate)
+        command, make = self._steered(stack)
+        config = seated(command.env_config(), stack.rate)
         start = Start(config, config.load_vehicle(), mode, self._program(), self.real_time)
         flown: Flights = []
 
@@ -72,7 +78,7 @@ class Fly(EnvFlags, MavlinkFlags):
                 yield flight
 
         with self._opened(config) as env:
-            seat = Seat(env.env_spec, start, stack.make)
+            seat = Seat(env.env_spec, start, make)
             began = time.perf_counter()
             with mavlink_out(self, env.env_spec) as env.observer:
                 if self.view:
@@ -87,6 +93,22 @@ class Fly(EnvFlags, MavlinkFlags):
             track = FilmTrack(name=self.autopilot, trajectories=flown, drones=config.drones)
             print(f"film       {self.film} ({film(self.film, [track], settings)} pictures)")
         return int(bool(seat.tally.faults))
+
+    def _steered(self, stack: "StackInfo") -> "tuple[Fly, MakeStack]":
+        """The command with the env of the policy that moves the sticks, and what begins a stack."""
+        if not self.policy:
+            return self, stack.make
+        if stack.name != "betaflight":
+            raise InputError(f"policy: expected betaflight, which has sticks, got {stack.name}")
+        from ..autopilots.sticks import Pilot
+        from ..envs.registry import env_spec
+        from ._env import pilot_of
+
+        command, policy = pilot_of(self, self.policy)
+        if policy is None:
+            raise InputError("policy: expected a checkpoint or a controller, got random")
+        pilot = Pilot(policy, env_spec(command.env_config()))
+        return command, partial(stack.make, pilot=pilot)
 
     def _program(self) -> Path | None:
         if self.connect and self.program:
