@@ -1,10 +1,15 @@
 """`rotorgram sim`: the simulator, a UDP client."""
 
 from contextlib import ExitStack
-from typing import Literal
+from typing import TYPE_CHECKING, Annotated, Literal
+
+from tyro.conf import arg
 
 from ..models import InputError
 from ._flags import MavlinkFlags, WireFlags, Words, parse_address
+
+if TYPE_CHECKING:
+    from ..udp.protocol.running import FreeRun
 
 
 class Sim(WireFlags, MavlinkFlags):
@@ -29,8 +34,26 @@ class Sim(WireFlags, MavlinkFlags):
     """Give up when the agent has been silent for so many seconds."""
     drop: float = 0.0
     """Lose each datagram, sent or received, with this probability: tries an agent under loss."""
+    free_running: Annotated[float | None, arg(metavar="RATE")] = None
+    """Keep time, at so many times real time, instead of waiting for each command. Late ones are
+    counted. Default: lock-step."""
+    silence: float = 0.5
+    """With --free-running: seconds without a command, of simulated time, until --after."""
+    after: Literal["hover", "land", "off", "hold"] = "hover"
+    """What the craft does then: hover, land, stop its rotors, or hold the last action."""
     view: bool = False
     """Show the first world in a window. Lock-step does not wait for it. Keys: docs/viewing.md."""
+
+    @property
+    def free_run(self) -> "FreeRun | None":
+        """How the simulator keeps time; None for lock-step."""
+        from ..udp.protocol.running import FreeRun
+
+        if self.free_running is not None:
+            return FreeRun(rate=self.free_running, silence=self.silence, after=self.after)
+        if self.given.isdisjoint(("silence", "after")):
+            return None
+        raise InputError("--silence, --after: expected them with --free-running")
 
     def run(self) -> None:
         """Simulate until the agent closes."""
@@ -56,6 +79,7 @@ class Sim(WireFlags, MavlinkFlags):
             key_file=self.key_file,
             insecure=self.insecure,
             record=self.record,
+            free_run=self.free_run,
         )
         links = simulator.rules.links
         there = f"{len(links)} agents" if several else f"the agent at {self.server}"

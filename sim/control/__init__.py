@@ -12,7 +12,7 @@ import numpy as np
 from ... import models
 from ...models.errors import InputError, shortened
 from ..effects import NO_EFFECTS, EffectOptions
-from ..state import Array, WorldState, clip, total
+from ..state import Array, WorldState, clip, stack, total
 from .cascade import Attitude, Numbers, Position, Rates, Velocity
 from .gains import Gains, shared_ranges
 
@@ -87,6 +87,14 @@ class CollectiveThrust:
         present = state.command if self._increment else self._hover
         return clip(present + self._per_action * share, self._low, self._high)
 
+    def action(self, collective: Array, state: WorldState) -> Array:
+        """Actions that ask for a collective thrust, N, shape (...)."""
+        present = state.command if self._increment else self._hover
+        share = (collective - total(present)) / total(self._per_action)
+        if self.choices:
+            return np.rint(clip(share, -1.0, 1.0)) + 1.0
+        return stack([share])
+
 
 class RotorThrust:
     """One number for each rotor: 0 is its thrust at hover, -1 its least and 1 its largest."""
@@ -106,6 +114,11 @@ class RotorThrust:
         above = clip(action, 0.0, 1.0)
         below = clip(action, -1.0, 0.0)
         return self._hover + self._up * above + self._down * below
+
+    def action(self, thrust: Array) -> Array:
+        """Actions that ask for thrusts, N, shape (..., R)."""
+        over = thrust - self._hover
+        return over / np.where(over > 0.0, self._up, self._down)
 
 
 class MixedController:
@@ -146,7 +159,7 @@ def make_controller(
     kinds = list(dict.fromkeys(members))
     controllers: list[Controller]
     if level in _CASCADE:
-        gains = [Gains.of(kind, period, _lag(kind, effects)) for kind in kinds]
+        gains = [Gains.of(kind, period, lag_of(kind, effects)) for kind in kinds]
         pairs = zip(kinds, shared_ranges(gains), strict=True)
         controllers = [_CASCADE[level](kind, own, effects) for kind, own in pairs]
     else:
@@ -158,7 +171,7 @@ def make_controller(
     return cast(Controller, mixed)
 
 
-def _lag(vehicle: "models.Vehicle", effects: EffectOptions) -> float:
+def lag_of(vehicle: "models.Vehicle", effects: EffectOptions) -> float:
     """Longest time constant of the rotors, s; 0 where they follow at once."""
     names = ("rotors.time_constant", "rotors.time_constant_down")
     times = [vehicle.coefficients[name] or 0.0 for name in names]

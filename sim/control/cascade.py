@@ -133,6 +133,11 @@ class Rates:
         """N, of a number in [-1, 1]."""
         return self._hover + self._up * clip(share, 0.0, 1.0) + self._down * clip(share, -1.0, 0.0)
 
+    def share(self, collective: Array) -> Array:
+        """The number that asks for a collective thrust, N."""
+        over = collective - self._hover
+        return over / np.where(over > 0.0, self._up, self._down)
+
 
 class Attitude(Rates):
     """Collective thrust, roll, pitch and yaw rate.
@@ -154,7 +159,7 @@ class Attitude(Rates):
         share, roll, pitch, yaw_rate = self._scaled(action)
         axes = axes_of(state.quaternion)
         cosine = cos(roll)
-        x, y = _turned(axes[0], cosine * sin(pitch), -sin(roll))
+        x, y = turned(axes[0], cosine * sin(pitch), -sin(roll))
         axis = x, y, cosine * cos(pitch)
         return self.point(self._collective(share), axis, yaw_rate, axes, state)
 
@@ -165,12 +170,15 @@ class Attitude(Rates):
 
         `axes` are the body's axes in the world frame; the yaw rate is about the vertical, rad/s.
         """
+        return self.turn(collective, self.rates_to(axis, yaw_rate, axes), state)
+
+    def rates_to(self, axis: Parts, yaw_rate: Array, axes: Rows) -> Parts:
+        """Body rates, rad/s, that `point` asks for."""
         x, y, z = times(axes, axis)
         aside = _ASIDE * (z < 0.0)
         # Of the turn by θ about (-y, x, 0) / sin θ: over cos(θ / 2), which is sqrt((1 + z) / 2).
         size = self.gains.attitude / square_root(0.5 * (1.0 + z) + 0.25 * (aside * aside))
-        rates = size * (aside - y), size * x, yaw_rate * axes[2][2]
-        return self.turn(collective, rates, state)
+        return size * (aside - y), size * x, yaw_rate * axes[2][2]
 
 
 class Velocity(Attitude):
@@ -192,10 +200,15 @@ class Velocity(Attitude):
         """As `Controller.thrust`."""
         x, y, z, yaw_rate = self._scaled(action)
         axes = axes_of(state.quaternion)
-        return self.fly((*_turned(axes[0], x, y), z), yaw_rate, axes, state)
+        return self.fly((*turned(axes[0], x, y), z), yaw_rate, axes, state)
 
     def fly(self, velocity: Parts, yaw_rate: Array, axes: Rows, state: WorldState) -> Array:
         """As `point`, for a velocity in the world frame, m/s."""
+        collective, axis = self.aim(velocity, axes, state)
+        return self.point(collective, axis, yaw_rate, axes, state)
+
+    def aim(self, velocity: Parts, axes: Rows, state: WorldState) -> tuple[Array, Parts]:
+        """Collective thrust, N, and thrust axis that `fly` asks for."""
         gains = self.gains
         gravity = self._gravity
         level, up = gains.most_acceleration
@@ -210,7 +223,7 @@ class Velocity(Attitude):
         y = share * y
         size = square_root(x * x + y * y + z * z)
         collective = self._mass * dot((x, y, z), axes[2])
-        return self.point(collective, (x / size, y / size, z / size), yaw_rate, axes, state)
+        return collective, (x / size, y / size, z / size)
 
 
 class Position(Velocity):
@@ -239,7 +252,7 @@ class Position(Velocity):
         level, up = gains.most_acceleration
         fast, climb = gains.most_velocity
         along = self._gain(_length(x, y), level, fast)
-        x, y = _turned(axes[0], along * x, along * y)
+        x, y = turned(axes[0], along * x, along * y)
         z = self._gain(_length(z), up, climb) * z
         most = gains.most_rate[2]
         return self.fly((x, y, z), clip(gains.heading * heading, -most, most), axes, state)
@@ -265,7 +278,7 @@ def _throttle(curve: Numbers) -> np.ndarray:
     return low
 
 
-def _turned(nose: Parts, x: Array, y: Array) -> tuple[Array, Array]:
+def turned(nose: Parts, x: Array, y: Array) -> tuple[Array, Array]:
     """A horizontal vector of the frame turned by the heading, in the world frame.
 
     The heading is the direction of the nose on the ground; 0 where the nose is vertical.

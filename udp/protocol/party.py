@@ -32,6 +32,7 @@ class World(Protocol):
     rewards: NDArray[np.float64]
     terminated: Mask
     truncated: Mask
+    done: Mask
     out: Mask
 
     @property
@@ -118,6 +119,8 @@ class WorldRules:
         links: The agents.
         reason: Why the flight has ended; None before.
         cause: The Command that moved the world; the driver sets it to None when it has looked.
+        unasked: Steps of the world that no Command has asked for.
+        more: Telemetry beside the world's, of all drones.
     """
 
     world: World
@@ -129,6 +132,8 @@ class WorldRules:
         self.reason: str | None = None
         self.cause: Command | None = None
         self._due: Links = []  # of States
+        self.unasked = 0
+        self.more: tuple[Array, ...] = ()
 
     def start(self, now: float) -> None:
         """Say Hello to every agent."""
@@ -178,12 +183,12 @@ class WorldRules:
             rows = link.rows
             own = itemgetter(rows)
             link.client.send_state(
-                link.client.sequence * self.period,
+                (link.client.sequence + self.unasked) * self.period,
                 tuple(map(own, world.observations.values())),
                 world.rewards[rows],
                 world.terminated[rows],
                 world.truncated[rows],
-                tuple(map(own, world.telemetry.values())),
+                tuple(map(own, (*world.telemetry.values(), *self.more))),
                 now,
             )
 
@@ -194,6 +199,14 @@ class WorldRules:
 def first_seeds(seed: int, drones: int) -> Seeds:
     """Seeds of a simulator's own first reset: drone i takes seed + i, modulo 2^64."""
     return np.uint64(seed) + np.arange(drones, dtype=np.uint64)
+
+
+def neutral(layout: Layout) -> Array:
+    """Actions that change nothing."""
+    actions = layout.actions.zeros()
+    if layout.choices:
+        actions += (layout.choices - 1) // 2
+    return actions
 
 
 def reset_of_all(layout: Layout, seeds: Seeds | None) -> Command:
@@ -334,10 +347,7 @@ class SeveralAgents(WorldRules):
 
     def _fly(self, flying: Links) -> None:
         """Fly the world for one control period."""
-        layout = self.layout
-        actions = layout.actions.zeros()
-        if layout.choices:
-            actions += (layout.choices - 1) // 2  # hold
+        actions = neutral(self.layout)
         staying = []
         for link in flying:
             assert link.command is not None
@@ -347,7 +357,7 @@ class SeveralAgents(WorldRules):
                 staying.append(link)
                 actions[link.rows] = link.command.actions
         self.steps += 1
-        orders = np.full(layout.drones, FLY, np.uint8)
+        orders = np.full(self.layout.drones, FLY, np.uint8)
         self.cause = Command(session=0, sequence=self.steps, actions=actions, orders=orders)
         self.world.advance(actions, None, None, None)
         for link in staying:

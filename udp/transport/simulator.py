@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Literal
 import gymnasium as gym
 
 from ...envs.config import DEFAULT_ENV, EnvConfig
-from ...envs.spec import EnvSpec
+from ...envs.spec import ArraySpec, EnvSpec
 from ...models.errors import InputError, NotCopied
 from ...models.fields import Choice, Limits, check
 from ..layouts import layout_of
@@ -21,6 +21,7 @@ from ..protocol import binary
 from ..protocol.auth import Key, read_key
 from ..protocol.client import Address, Client, LinkConfig, largest_datagram, random_number
 from ..protocol.errors import LinkError
+from ..protocol.layout import Layout
 from ..protocol.messages import Command, Hello
 from ..protocol.party import (
     NO_RESET,
@@ -29,14 +30,24 @@ from ..protocol.party import (
     Rules,
     SeveralAgents,
 )
+from ..protocol.running import FreeRun, FreeRunning
 from .sockets import LONGEST_WAIT, PAUSE, TEXT_WAY_OUT, WAY_OUT, Port, resolve
-from .stepped import GymEnv, GymnasiumWorld, make_stepped
+from .stepped import GymEnv, GymnasiumWorld, Steppable, make_stepped
 
 if TYPE_CHECKING:
     from ..journal import Journal
 
 DEFAULT_AGENT = ("127.0.0.1", 8001)
 DEFAULT_SIMULATOR = ("127.0.0.1", 8000)
+COMMAND_AGE = ArraySpec(
+    name="command_age",
+    shape=(1,),
+    dtype="float64",
+    low=0.0,
+    unit="s",
+    components=("command_age",),
+)
+"""In the telemetry of a simulator that keeps time: see `FreeRunning`."""
 _ALIVE_EVERY = 0.5  # period of the message Alive while an agent waits for a State, s
 
 Observer = Callable[[Command], None]
@@ -64,6 +75,7 @@ class Simulator(NotCopied):
             come back, s.
         key_file: As `AgentSettings`, and so are `insecure` and `record`.
         patience: Longest wait for a Command of one of several agents, s.
+        free_run: Keep time instead of lock-step, with one agent.
         keywords: As of `EnvConfig.from_keywords`, with an id: `drones` of each world, `vehicle` …
 
     Attributes:
@@ -96,6 +108,7 @@ class Simulator(NotCopied):
         insecure: bool = False,
         record: Path | str | None = None,
         patience: float = 10.0,
+        free_run: FreeRun | None = None,
         **keywords: object,
     ) -> None:
         check("codec", Choice(("binary", "text")), codec)
@@ -111,7 +124,7 @@ class Simulator(NotCopied):
         with ExitStack() as failing:  # closes what is open if a later step fails
             self.stepped = stepped = make_stepped(env, num_envs, keywords)
             failing.callback(stepped.close)
-            self.spec = spec = stepped.spec
+            self.spec = spec = with_age(stepped.spec) if free_run else stepped.spec
             worlds = stepped.num_envs // len(spec.agents)
             layout = layout_of(spec, worlds)
             servers = [server] if agents is None else list(agents)
@@ -130,13 +143,15 @@ class Simulator(NotCopied):
                 raise InputError(
                     f"server: expected the address of an agent, got that of this side, {bind}"
                 )
-            period = spec.control_period
-            if agents is None:
-                self.rules: Rules = OneAgent(stepped, layout, period, links)
+            self.rules: Rules
+            if free_run:
+                self.rules = _free_running(stepped, layout, links, free_run)
+            elif agents is None:
+                self.rules = OneAgent(stepped, layout, spec.control_period, links)
             elif isinstance(stepped, GymnasiumWorld):
                 raise InputError(f"env: expected a registered task for several drones, got {env!r}")
             else:
-                self.rules = SeveralAgents(stepped, layout, period, links, patience)
+                self.rules = SeveralAgents(stepped, layout, spec.control_period, links, patience)
             if record:
                 self._record(record)
             failing.pop_all()
@@ -289,6 +304,31 @@ class Simulator(NotCopied):
         link.tap = self._journal.tap
         if link.by_text:  # says no Hello
             link.tap(0, link.hello, binary.encode(link.hello))
+
+
+def with_age(spec: EnvSpec) -> EnvSpec:
+    """The spec of a simulator that keeps time."""
+    return replace(spec, telemetry=(*spec.telemetry, COMMAND_AGE))
+
+
+def _free_running(
+    stepped: Steppable, layout: Layout, links: list[AgentLink], run: FreeRun
+) -> FreeRunning:
+    """The rules of a simulator that keeps time. Raises `InputError` for several agents, for text,
+    and for drones that cannot be flown without an agent.
+    """
+    from ...envs.failsafe import Failsafe
+    from ...envs.loop import Loop
+
+    if len(links) > 1 or links[0].client.by_text:
+        raise InputError("free_run: expected one agent and binary messages")
+    failsafe = None
+    if run.after != "hold":
+        if not isinstance(stepped, Loop):
+            raise InputError(f"after: expected hold with {stepped.spec.env_id}, got {run.after}")
+        pilot = Failsafe(stepped.task, run.after)
+        failsafe = lambda: pilot.actions(stepped.telemetry)  # noqa: E731
+    return FreeRunning(stepped, layout, stepped.spec.control_period, links, run, failsafe)
 
 
 def _links(

@@ -85,7 +85,7 @@ class GymnasiumWorld:
         self.terminated = np.zeros(1, bool)
         self.truncated = np.zeros(1, bool)
         self._env = env
-        self.out = np.ones(1, bool)  # it waits for a reset
+        self.out = self.done = np.ones(1, bool)  # it waits for a reset
 
     def advance(
         self,

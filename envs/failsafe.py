@@ -1,0 +1,85 @@
+"""Actions for a craft that nobody commands: it hovers, lands, or its rotors stop.
+
+They are of the env's own action level, so whatever flies the env flies them.
+"""
+
+from collections.abc import Mapping
+from typing import Literal
+
+import numpy as np
+
+from ..models.errors import InputError
+from ..sim.control import CollectiveThrust, RotorThrust, lag_of
+from ..sim.control.cascade import Attitude, Position, Rates, Velocity, turned
+from ..sim.control.gains import Gains
+from ..sim.rotations import axes_of
+from ..sim.state import Array, WorldState, clip, stack
+from .tasks.task import Task
+
+Measure = Literal["hover", "land", "off"]
+"""What a craft does: it brakes and stays, it descends, or its rotors give their least thrust."""
+DESCENT = 0.5
+"""Speed of a landing, m/s: the default of ArduCopter's LAND_SPEED."""
+
+
+class Failsafe:
+    """Actions that hover, land or stop the rotors of a task's drones, from their telemetry.
+
+    Raises `InputError` for a controller of the task's own, for vehicles that differ, and for rotors
+    that cannot roll, pitch and yaw; for `off` at another level than `rotors`.
+    """
+
+    def __init__(self, task: Task, measure: Measure) -> None:
+        self._controller = controller = task.controller
+        vehicle = task.vehicle
+        effects = task.config.effects
+        if not isinstance(controller, RotorThrust | CollectiveThrust | Rates):
+            raise InputError(
+                "failsafe: expected actions of a level, and drones of one vehicle, "
+                f"got {type(controller).__name__} of {vehicle.name}"
+            )
+        if measure == "off" and not isinstance(controller, RotorThrust):
+            raise InputError(f"off: expected actions of the level rotors, got {task.action}")
+        self._measure = measure
+        gains = Gains.of(vehicle, task.control_period, lag_of(vehicle, effects))
+        self._pilot = Velocity(vehicle, gains, effects)
+
+    def actions(self, telemetry: Mapping[str, Array]) -> Array:
+        """Actions of N drones, float64, shape (N, k); choices have the shape (N,).
+
+        Telemetry has `attitude`, `velocity`, `body_rates` and `thrust`, (N, ...).
+        """
+        thrust = telemetry["thrust"]
+        if self._measure == "off":
+            return -np.ones_like(thrust)
+        state = WorldState(
+            velocity=telemetry["velocity"],
+            body_rates=telemetry["body_rates"],
+            command=thrust,
+            thrust=thrust,
+            touching=None,
+        )
+        return self._climbing(-DESCENT * (self._measure == "land"), state, telemetry["attitude"])
+
+    def _climbing(self, speed: float, state: WorldState, quaternion: Array) -> Array:
+        """Actions that ask for a vertical speed, m/s, and for none across."""
+        controller = self._controller
+        pilot = self._pilot
+        axes = axes_of(quaternion)
+        collective, axis = pilot.aim((0.0, 0.0, speed), axes, state)
+        rates = pilot.rates_to(axis, 0.0, axes)
+        if isinstance(controller, RotorThrust):
+            return controller.action(pilot.turn(collective, rates, state))
+        if isinstance(controller, CollectiveThrust):
+            return controller.action(collective, state)
+        assert isinstance(controller, Rates)
+        asked = [controller.share(collective), *rates]
+        if isinstance(controller, Velocity):
+            gain = controller.gains.position if isinstance(controller, Position) else 1.0
+            still = 0.0 * collective
+            asked = [still, still, still + speed / gain, still]
+        elif isinstance(controller, Attitude):
+            x, y, _ = axes[0]
+            forward, left = turned((x, -y), axis[0], axis[1])
+            asked[1:] = np.arcsin(-left), np.arctan2(forward, axis[2]), 0.0
+        return clip(stack(asked) / controller.constants["action_scale"], -1.0, 1.0)
