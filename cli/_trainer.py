@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 
 from ..agents import Checkpoint, Episode, find_algorithm, find_preset, load, preset, store
 from ..envs.autoreset import AdvancingVectorEnv
-from ..envs.config import BackendConfig
+from ..envs.config import BackendConfig, EnvConfig
 from ..flights.folders import locked
 from ..models import Backend, InputError
 from ..models.errors import require
@@ -139,6 +139,8 @@ def _train(command: "Train", training: Training, folder: Path) -> int:
     if not find_algorithm(command.algorithm).resumes:
         stopped = "it starts anew" if command.resume else "--resume starts it anew"
         print(f"note: {command.algorithm} keeps no state of a training: {stopped}")
+    if command.listen is None:
+        _note_lag(training.run.env)
     go_on = command.go_on_with(f"train {command.algorithm}", folder, *_WIRE)
     keeper = _Keeper(training, folder, command.store_every)
     try:
@@ -170,6 +172,17 @@ def _train(command: "Train", training: Training, folder: Path) -> int:
     print(f"{flown / training.log.seconds:,.0f} env steps per second")
     print(f"checkpoint: {folder / CHECKPOINT}" if finished else go_on)
     return 0 if finished else 128 + stop_is_asked()
+
+
+def _note_lag(env: EnvConfig) -> None:
+    """Tell if the vehicle's rotors lag, and those of the training do not."""
+    vehicle = env.load_vehicle()
+    lag = vehicle.coefficients["rotors.time_constant"]
+    if lag and not env.effects.motor_lag:
+        print(
+            f"note: the rotors of {vehicle.name} follow within {lag:g} s, those of this training "
+            "at once: --effects motor_lag trains for the craft itself"
+        )
 
 
 def _extended(kept: Checkpoint, folder: Path, env_steps: int) -> Checkpoint:

@@ -1,4 +1,4 @@
-"""A trained policy as one file that flies without rotorgram: ONNX or C.
+"""A trained policy as one file that flies without rotorgram: ONNX or C; or an app of a firmware.
 
 The file has the whole of `NetworkPolicy.act`: layers, activation, squashing, mapping to the env's
 action, clipping to its bounds; or the choice of the largest output. The action is the deterministic
@@ -11,6 +11,7 @@ from importlib import import_module
 
 import numpy as np
 
+from ...envs.config import EnvConfig
 from ...models.errors import InputError, require
 from ..checkpoints import Checkpoint
 from ..layers import Layer
@@ -39,9 +40,7 @@ def export(checkpoint: Checkpoint, target: str) -> bytes:
     if target == "onnx":
         require("onnx", "export", "--to onnx")
     module = import_module(f"{__name__}.{target}")
-    policy = checkpoint.policy()
-    _check_finite(policy)
-    return bytes(module.write(policy, metadata(checkpoint)))
+    return bytes(module.write(finite_policy(checkpoint), metadata(checkpoint)))
 
 
 def write_layers(writer: object, layers: Iterable[Layer]) -> None:
@@ -58,7 +57,9 @@ def write_layers(writer: object, layers: Iterable[Layer]) -> None:
         write(layer)
 
 
-def _check_finite(policy: NetworkPolicy) -> None:
+def finite_policy(checkpoint: Checkpoint) -> NetworkPolicy:
+    """The policy. Raises `InputError` for one that diverged."""
+    policy = checkpoint.policy()
     bounds = [np.abs(array.bounds()).max(axis=0) for array in policy.spec.observation]
     largest = np.minimum(np.concatenate(bounds, axis=None), _FAR)
     shares = np.random.default_rng(0).uniform(-1.0, 1.0, (_TRIED, largest.size))
@@ -66,6 +67,7 @@ def _check_finite(policy: NetworkPolicy) -> None:
         outputs = policy.outputs((shares * largest).astype(np.float32))
     if not np.isfinite(outputs).all():
         raise InputError("policy: expected finite actions, got NaN or infinity: training diverged")
+    return policy
 
 
 def metadata(checkpoint: Checkpoint) -> dict[str, str]:
@@ -73,8 +75,9 @@ def metadata(checkpoint: Checkpoint) -> dict[str, str]:
 
     `format`, `algorithm`, `seed`, `env_steps` (trained so far), and of the spec `env_id`,
     `options`, `control_period` (s), `vehicle`, `vehicle_hash`, `observation`, `action`; `inputs` is
-    the length of the observation as the file takes it: all its arrays, one after the other.
-    A value that is not a text is JSON.
+    the length of the observation as the file takes it: all its arrays, one after the other; and
+    `rotors`, which `rotors_of` has, where the checkpoint knows its vehicle. A value that is not a
+    text is JSON.
     """
     spec = checkpoint.spec.for_actor()
     fields = json.loads(spec.to_json())
@@ -86,7 +89,28 @@ def metadata(checkpoint: Checkpoint) -> dict[str, str]:
         "inputs": flat_size(spec),
         **{name: fields[name] for name in _SPEC},
     }
+    if checkpoint.env and len(checkpoint.env.vehicle) < 2:
+        facts["rotors"] = rotors_of(checkpoint.env)
     return {
         name: value if isinstance(value, str) else json.dumps(value, ensure_ascii=False)
         for name, value in facts.items()
+    }
+
+
+def rotors_of(env: EnvConfig) -> dict[str, list[float]]:
+    """Numbers of the rotors of an env's one vehicle, as `c.ROTORS` lists them."""
+    vehicle = env.load_vehicle()
+    coefficients = vehicle.coefficients
+    rise = coefficients["rotors.time_constant"] if env.effects.motor_lag else 0.0
+    fall = coefficients["rotors.time_constant_down"] if env.effects.motor_lag else 0.0
+    carried = 1.0 + env.task.get("payload_share", 0.0)
+    reactions = [np.dot(rotor.reaction, rotor.axis) for rotor in vehicle.rotors]
+    return {
+        "hover": vehicle.hover_thrust.tolist(),
+        "least": vehicle.thrust_low.tolist(),
+        "largest": vehicle.thrust_high.tolist(),
+        "initial": (carried * vehicle.hover_thrust).tolist(),
+        "positions": [number for rotor in vehicle.rotors for number in rotor.position],
+        "turns": (-np.sign(reactions)).astype(int).tolist(),
+        "lags": [rise, fall or rise],
     }

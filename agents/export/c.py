@@ -3,6 +3,7 @@
 A spec comes from a file or a peer, so that none of its texts may be trusted.
 """
 
+import json
 import re
 from collections.abc import Iterable, Iterator, Mapping
 
@@ -21,6 +22,17 @@ from ..layers import BRIGHTEST, Affine, Floats, Layer, Scaling
 from ..memory import GRU
 from ..policies import NetworkPolicy, flat_size
 from . import write_layers
+
+ROTORS = {
+    "hover": "N",
+    "least": "N",
+    "largest": "N",
+    "initial": "N: when an episode begins",
+    "positions": "m: x forward, y left, z up of each rotor in turn",
+    "turns": "1: anticlockwise seen from above, -1: clockwise",
+    "lags": "s: time constants of the speed, rising and falling; 0: trained without lag",
+}
+"""What is told of the rotors, in the order of the vehicle's file, and its unit."""
 
 _LARGEST = float(np.finfo(np.float32).max)
 _PAIRS = re.compile(r"(?<=\*)(?=/)|(?<=/)(?=\*)|(?<=\?)(?=\?)")
@@ -105,6 +117,8 @@ def write(policy: NetworkPolicy, facts: Mapping[str, str]) -> bytes:
         f"#define ROTORGRAM_ACTIONS {policy.actions.size}",
         f"#define ROTORGRAM_TELEMETRY {sum(map(_text_size, policy.spec.telemetry))}",
         f"#define ROTORGRAM_CONTROL_PERIOD {facts['control_period']}",
+        *_rotor_macros(facts),
+        *_goal_macro(policy.spec),
     ]
     arguments = f"const float observation[{facts['inputs']}], float action[{policy.actions.size}]"
     if policy.memory:
@@ -127,12 +141,25 @@ def write(policy: NetworkPolicy, facts: Mapping[str, str]) -> bytes:
     return "\n".join(parts).encode()
 
 
+def cost(policy: NetworkPolicy) -> str:
+    """What a call takes, in words."""
+    program = _Program(policy)
+    constants = 4 * sum(values.size for values in program.tables.values())
+    return (
+        f"{program.products:,} products and {program.tanhs:,} tanh a call, "
+        f"{constants:,} bytes of constants, {4 * program.numbers:,} bytes of the stack"
+    )
+
+
 class _Program:
     """Statements, and the tables that they use, of the layers of a policy.
 
     Attributes:
         at: Name of the array with the numbers so far, `size` of them.
         functions: Texts of those that the statements call.
+        products: Multiplications by weights in a call.
+        tanhs: Evaluations of tanh, a gate's among them.
+        numbers: Length of all arrays that a call declares.
     """
 
     def __init__(self, policy: NetworkPolicy) -> None:
@@ -141,6 +168,7 @@ class _Program:
         self.lines: list[str] = []
         self.at = "observation"
         self.size = flat_size(policy.spec)
+        self.products = self.tanhs = self.numbers = 0
         write_layers(self, policy.network.layers)
         if policy.actions.discrete:
             self.lines.append("action[0] = 0.0f;")
@@ -157,11 +185,13 @@ class _Program:
 
     def tanh(self, layer: Layer) -> None:
         self._needs(_TANH)
+        self.tanhs += self.size
         self._each(f"{self.at}[i] = rotorgram_tanh({self.at}[i]);")
 
     def _sum(self, weight: Floats, inputs: str) -> str:
         """An affine layer over an array; the name of its outputs."""
         units, size = weight.shape
+        self.products += units * (size - 1)
         outputs = self._array(units)
         table = self._table(weight)
         arguments = f"{table}, {inputs}, {size - 1}, {outputs}, {units}"
@@ -172,6 +202,7 @@ class _Program:
         self._needs(_CONVOLUTION)
         filters = len(layer.weight)
         rows, windows = layer.places[1:].shape
+        self.products += filters * rows * windows
         tables = f"{self._table(layer.weight)}, {self._table(layer.places[1:] - 1)}"
         inputs = f"{rows}, {windows}, {self.at}"
         outputs = self._array(filters * windows)
@@ -195,6 +226,7 @@ class _Program:
     def gru(self, layer: GRU) -> None:
         self._needs(_TANH)
         self._needs(_GRU)
+        self.tanhs += 3 * layer.units
         sums = self._sum(layer.weight, self.at)
         without_bias = np.zeros_like(layer.recurrent[:, :1])
         recurrent = np.concatenate((without_bias, layer.recurrent), axis=1)
@@ -207,6 +239,7 @@ class _Program:
         """The name of a new array of numbers, which is that of the numbers so far."""
         self.at = f"x{len(self.lines)}"
         self.size = size
+        self.numbers += size
         self.lines.append(f"float {self.at}[{size}];")
         return self.at
 
@@ -272,12 +305,41 @@ def _table(values: np.ndarray) -> str:
 
     Infinite ones are the largest float32: C has no infinity without a library.
     """
-    words = [str(value) for value in values.ravel().tolist()]
-    if values.dtype.kind == "f":
-        finite = values.clip(-_LARGEST, _LARGEST)
-        words = [_number(value) for value in finite.ravel().tolist()]
+    words = _words(values)
     lines = [", ".join(words[first : first + 6]) for first in range(0, len(words), 6)]
     return ",\n".join(f"    {line}" for line in lines)
+
+
+def _words(values: np.ndarray) -> list[str]:
+    """Numbers as literals."""
+    if values.dtype.kind != "f":
+        return [str(value) for value in values.ravel().tolist()]
+    finite = values.clip(-_LARGEST, _LARGEST)
+    return [_number(value) for value in finite.ravel().tolist()]
+
+
+def macro(name: str, values: object, comment: str = "") -> str:
+    """A macro whose value initialises an array."""
+    numbers = ", ".join(_words(np.asarray(values)))
+    return f"#define ROTORGRAM_{name.upper()} {{{numbers}}} /* {_comment(comment)} */"
+
+
+def _rotor_macros(facts: Mapping[str, str]) -> Iterator[str]:
+    """What the checkpoint knows of the rotors."""
+    rotors = json.loads(facts.get("rotors", "{}"))
+    if rotors:
+        yield "\n/* Of the rotors, in the order of the vehicle's file. */"
+        yield f"#define ROTORGRAM_ROTORS {len(rotors['hover'])}"
+    for name, values in rotors.items():
+        yield macro(name, values, ROTORS[name])
+
+
+def _goal_macro(spec: EnvSpec) -> Iterator[str]:
+    """Where the observation has what follows the goal."""
+    names = [name for array in spec.observation for name in component_names(array)]
+    goal = {i: name for i, name in enumerate(names) if name.startswith("goal")}
+    if goal:
+        yield macro("goal", [*goal], "elements of the observation: " + ", ".join(goal.values()))
 
 
 def _about(spec: EnvSpec, facts: Mapping[str, str]) -> list[str]:

@@ -1,0 +1,120 @@
+"""The Crazyflie's firmware: an app whose out-of-tree controller is the policy.
+
+The folder `crazyflie_app` has the files that are the same for every policy.
+"""
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+
+from ...envs.config import EnvConfig
+from ...envs.spec import EnvSpec, component_names
+from ...models.errors import InputError, shortened
+from ...models.files import read_own_toml
+from ..checkpoints import Checkpoint
+from . import c, finite_policy, metadata
+
+_FILES = ("Makefile", "Kbuild", "oot-config", "rotorgram_controller.c")
+_FOLDER = Path(__file__).with_name("crazyflie_app")
+_CALLS = 1000
+"""Of the controller, per second."""
+_MOTORS = ((1, -1), (-1, -1), (-1, 1), (1, 1))
+"""Signs of x and y of the motors M1 to M4, which turn anticlockwise and clockwise in turn."""
+_REFUSED = ("thrust_curve", "battery", "efficiency")
+"""Effects with which a command is no thrust in newtons; the firmware's is one."""
+
+
+def app(checkpoint: Checkpoint) -> dict[str, bytes]:
+    """The files of the app, by name.
+
+    Raises `InputError`, which names what the firmware cannot know or do.
+    """
+    env = checkpoint.env
+    if env is None or len(env.vehicle) > 1:
+        raise InputError(
+            "export: expected a policy that was trained on one vehicle of this machine"
+        )
+    _check_env(env)
+    policy = finite_policy(checkpoint)
+    facts = metadata(checkpoint)
+    files = {name: (_FOLDER / name).read_bytes() for name in _FILES}
+    files["rotorgram_policy.h"] = c.write(policy, facts)
+    lines = _firmware_macros(policy.spec, json.loads(facts["rotors"]))
+    files["rotorgram_crazyflie.h"] = ("\n".join(lines) + "\n").encode()
+    return files
+
+
+def _check_env(env: EnvConfig) -> None:
+    if env.action != "rotors":
+        raise InputError(f"action: expected rotors for the firmware's motors, got {env.action}")
+    refused = [name for name in _REFUSED if getattr(env.effects, name)]
+    if refused:
+        raise InputError(
+            "effects: expected those with which a command is a thrust, as the firmware's, "
+            f"got {', '.join(refused)}"
+        )
+
+
+def _firmware_macros(spec: EnvSpec, rotors: dict[str, list[float]]) -> Iterator[str]:
+    """Lines of the header that the controller's C includes beside the policy's."""
+    calls = spec.control_period * _CALLS
+    if abs(calls - round(calls)) > 1e-6:
+        raise InputError(
+            f"control_period: expected a whole number of milliseconds, got {spec.control_period} s"
+        )
+    frames = _names()["frames"]
+    frame = spec.observation[0].frame
+    if frame not in frames:
+        raise InputError(
+            f"observation: expected the frame {' or '.join(frames)}, got {shortened(frame)}"
+        )
+    bounds = [array.bounds() for array in spec.observation]
+    lowest, highest = (np.concatenate(ends, axis=None) for ends in zip(*bounds, strict=True))
+    lags = np.array(rotors["lags"])
+    lacking = np.exp(-spec.control_period / np.where(lags > 0.0, lags, 1e-9))
+    yield "/* SPDX-License-Identifier: MIT */"
+    yield f"#define ROTORGRAM_CALLS {round(calls)} /* of the controller, between two actions */"
+    yield f"#define ROTORGRAM_BODY {frames[frame]} /* whether vectors are in the body frame */"
+    yield c.macro("motors", _rotor_of_motors(rotors), "rotor of M1 to M4")
+    yield c.macro("lacking", lacking, "of a change of speed after a period, rising and falling")
+    yield c.macro("lowest", lowest, "of the observation")
+    yield c.macro("highest", highest, "of the observation")
+    yield "#define ROTORGRAM_SOURCES {" + ", ".join(_sources(spec)) + "}"
+
+
+def _names() -> dict[str, dict[str, str]]:
+    return read_own_toml(str(_FOLDER / "names"), "names")
+
+
+def _sources(spec: EnvSpec) -> Iterator[str]:
+    """The controller's expression for each number of the observation."""
+    known = {
+        f"{name} {axis}": f"seen.{field}[{place}]"
+        for name, field in _names()["sources"].items()
+        for place, axis in enumerate("xyz")
+    }
+    known |= {f"thrust {i + 1} over hover": f"seen.over[{i}]" for i in range(len(_MOTORS))}
+    for array in spec.observation:
+        for name in component_names(array):
+            if name not in known:
+                raise InputError(
+                    "observation: expected numbers that the Crazyflie's firmware knows, "
+                    f"got {shortened(name)}"
+                )
+            yield known[name]
+
+
+def _rotor_of_motors(rotors: dict[str, list[float]]) -> list[int]:
+    """The rotor that is each motor. Raises `InputError` for another kind of craft."""
+    signs = np.sign(np.reshape(rotors["positions"], (-1, 3))[:, :2]).astype(int)
+    places = [tuple(row) for row in signs.tolist()]
+    if sorted(places) == sorted(_MOTORS) and min(rotors["least"]) >= 0.0:
+        found = [places.index(place) for place in _MOTORS]
+        if [rotors["turns"][rotor] for rotor in found] == [1, -1, 1, -1]:
+            return found
+    raise InputError(
+        "vehicle: expected four rotors that turn as the Crazyflie's do, the front right one "
+        f"anticlockwise, got rotors at {shortened(rotors['positions'])}, of turns {rotors['turns']}"
+    )

@@ -1,0 +1,280 @@
+"""The Crazyflie's app: built for this machine, it asks for the thrusts that the policy asks for."""
+
+import shutil
+import subprocess
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from nets import random_policy
+from rotorgram.agents import Checkpoint, load, preset, store
+from rotorgram.agents.episodes import Position
+from rotorgram.agents.export.crazyflie import app
+from rotorgram.cli import main
+from rotorgram.envs import LocalVectorEnv
+from rotorgram.envs.config import EnvConfig
+from rotorgram.envs.registry import env_spec
+from rotorgram.models.errors import InputError
+from rotorgram.models.library import find_vehicle
+from test_peers import ROOT, compiled, tool
+
+STUB = ROOT / "tests" / "data" / "crazyflie_stub"
+C_FLAGS = ["-std=gnu11", "-O2", "-Wall", "-Wextra", "-Wdouble-promotion", "-Wfloat-conversion"]
+CHECKED = ["-Werror", "-fsanitize=address,undefined", "-fno-sanitize-recover=all"]
+ARM = 0.046 * np.sqrt(0.5)
+TORQUE = 0.005964552
+"""Torque of a rotor over its thrust, m."""
+HOVER = 0.027 * 9.81 / 4
+LARGEST = 0.15916628
+LAG = {"motor_lag": True}
+
+
+def checkpoint_of(
+    env_id: str = "rotorgram/Hover-v0", memory: int = 0, **keywords: Any
+) -> Checkpoint:
+    """A policy of random weights, of a Crazyflie on `rigid`."""
+    given = {"vehicle": "crazyflie2", "backend": "rigid", "effects": LAG, **keywords}
+    config = EnvConfig.from_keywords(env_id, **given)
+    spec = env_spec(config)
+    policy = random_policy(spec, (16,), "tanh", 0.1, memory=memory)
+    chosen = preset("ppo", "tuned", hidden=(16,), activation="tanh", memory=memory)
+    return Checkpoint(
+        algorithm="ppo",
+        config=vars(chosen),
+        spec=spec,
+        env=config,
+        seed=0,
+        env_steps=0,
+        actor=policy.weights.arrays,
+        state={},
+        position=Position(env_steps=0, seconds=0.0),
+    )
+
+
+@pytest.fixture
+def built(tmp_path: Path) -> Callable[[Checkpoint], Path]:
+    def build(checkpoint: Checkpoint) -> Path:
+        for name, content in app(checkpoint).items():
+            (tmp_path / name).write_bytes(content)
+        for file in STUB.iterdir():
+            shutil.copy(file, tmp_path)
+        sources = [tmp_path / "rotorgram_controller.c", tmp_path / "main.c"]
+        program = tmp_path / "app"
+        compiled(tool("gcc"), *C_FLAGS, *CHECKED, "-o", program, *sources, "-lm")
+        return program
+
+    return build
+
+
+def forces(program: Path, records: np.ndarray) -> np.ndarray:
+    """Thrust of M1 to M4 after each record, N, as the firmware's mixer takes the sums apart."""
+    done = subprocess.run(
+        [str(program)],
+        input=records.astype(np.float32).tobytes(),
+        capture_output=True,
+        timeout=60,
+    )
+    assert done.returncode == 0, done.stderr
+    sums = np.frombuffer(done.stdout, np.float32).reshape(-1, 4).astype(float)
+    thrust, roll, pitch, yaw = (sums / [1.0, ARM, ARM, TORQUE]).T
+    motors = (
+        thrust - roll - pitch - yaw,
+        thrust - roll + pitch + yaw,
+        thrust + roll + pitch - yaw,
+        thrust + roll - pitch + yaw,
+    )
+    return np.stack(motors, axis=-1) / 4
+
+
+def record(
+    goal: tuple[float, ...] | None,
+    position: Any = (0.0, 0.0, 0.0),
+    velocity: Any = (0.0, 0.0, 0.0),
+    quaternion: Any = (1.0, 0.0, 0.0, 0.0),
+    rates: Any = (0.0, 0.0, 0.0),
+    calls: int = 20,
+) -> np.ndarray:
+    """A goal is x, y, z (m) and a heading (degrees); rates are rad/s."""
+    order = (1.0, *goal) if goal else (0.0,) * 5
+    gravity = (0.0, 0.0, 1.0)
+    yaw = 0.0
+    state = (*position, *velocity, *quaternion, *np.degrees(rates), *gravity, yaw)
+    return np.array([*order, *state, calls])
+
+
+def flown(checkpoint: Checkpoint, goal: tuple[float, ...]) -> tuple[np.ndarray, np.ndarray]:
+    """What the firmware would see in three episodes of the env, with motors off in between, and
+    the actions: the policy's, and -1, no thrust, where they are off.
+    """
+    assert checkpoint.env is not None
+    env = LocalVectorEnv(checkpoint.env, 1, autoreset_mode="Disabled")
+    policy = checkpoint.policy()
+    records, actions = [], []
+    for seed in range(3):
+        policy.reset()
+        seen, _ = env.reset(seed=seed)
+        done = False
+        while not done:
+            now = {name: values[0] for name, values in env.telemetry.items()}
+            words = (now["position"], now["velocity"], now["attitude"], now["body_rates"])
+            records.append(record(goal, *words))
+            actions.append(np.array(policy.act(seen[0]), float))
+            seen, _, terminated, truncated, _ = env.step(actions[-1][None])
+            done = bool(terminated[0] or truncated[0])
+        records.append(record(None))
+        actions.append(np.full(4, -1.0))
+    env.close()
+    assert len(actions) > 30
+    assert np.ptp(actions, axis=0).min() > 0.5
+    return np.array(records), np.array(actions)
+
+
+def asked(thrusts: np.ndarray) -> np.ndarray:
+    """Actions of the level `rotors` that thrusts are, N: 0 is a hover, 1 the largest."""
+    over = thrusts - HOVER
+    return np.where(over > 0, over / (LARGEST - HOVER), over / HOVER)
+
+
+CASES: dict[str, tuple[dict[str, Any], tuple[float, ...]]] = {
+    "hover": ({}, (0.0, 0.0, 5.0, 0.0)),
+    "without lag": ({"effects": {}}, (0.0, 0.0, 5.0, 0.0)),
+    "elsewhere": ({"goal": (2.0, -1.0, 7.0), "heading": 40.0}, (2.0, -1.0, 7.0, 40.0)),
+    "memory": ({"memory": 6}, (0.0, 0.0, 5.0, 0.0)),
+    "body frame": ({"env_id": "rotorgram/Recovery-v0"}, (0.0, 0.0, 20.0, 0.0)),
+}
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_it_asks_for_the_thrusts_of_the_policy(
+    case: str, built: Callable[[Checkpoint], Path]
+) -> None:
+    keywords, goal = CASES[case]
+    checkpoint = checkpoint_of(flight_band=20.0, **keywords)
+    records, actions = flown(checkpoint, goal)
+    found = asked(forces(built(checkpoint), records))
+    np.testing.assert_allclose(found, actions, rtol=0, atol=1e-5)
+
+
+def test_rotors_of_another_order_that_fall_more_slowly(
+    built: Callable[[Checkpoint], Path], tmp_path: Path
+) -> None:
+    text = find_vehicle("crazyflie2").read_text(encoding="utf-8")
+    text = text.replace("\n[rotors]\n", "\n[rotors]\ntime_constant_down = 0.15\n")
+    head, rotors_and_rest = text.split("[[rotors.list]]\n", 1)
+    listed, rest = rotors_and_rest.split("\n[rotors]\n", 1)
+    first, *others = listed.split("[[rotors.list]]\n")
+    turned = "".join(f"[[rotors.list]]\n{block.rstrip()}\n\n" for block in (*others, first))
+    vehicle = tmp_path / "turned.toml"
+    vehicle.write_text(f"{head}{turned}[rotors]\n{rest}", encoding="utf-8")
+    checkpoint = checkpoint_of(flight_band=20.0, vehicle=str(vehicle))
+    records, actions = flown(checkpoint, (0.0, 0.0, 5.0, 0.0))
+    found = asked(forces(built(checkpoint), records))
+    m1_last = np.roll(actions, 1, axis=1)  # the file now has M2, M3, M4, M1
+    np.testing.assert_allclose(found, m1_last, rtol=0, atol=1e-5)
+
+
+def test_motors_stop_without_a_setpoint_and_begin_anew(
+    built: Callable[[Checkpoint], Path],
+) -> None:
+    program = built(checkpoint_of(memory=6))
+    goal = (0.0, 0.0, 5.0, 0.0)
+    flying = [record(goal, (0.3, 0.2, 4.0), (0.1, 0.0, -0.3))] * 3
+    rows = [*flying, record(None, (0.3, 0.2, 4.0)), *flying]
+    found = forces(program, np.array(rows))
+    np.testing.assert_allclose(found[3], 0.0, atol=1e-9)
+    np.testing.assert_array_equal(found[:3], found[4:])
+    assert (found[0] != found[1]).any()  # the rotors of the model, and the memory, have moved on
+
+
+def test_it_acts_once_in_a_control_period(built: Callable[[Checkpoint], Path]) -> None:
+    goal = (0.0, 0.0, 5.0, 0.0)
+    near = record(goal, (0.3, 0.2, 4.0), calls=19)
+    far = record(goal, (-0.3, 0.9, 5.0), calls=1)
+    found = forces(built(checkpoint_of()), np.array([near, far, far]))
+    np.testing.assert_array_equal(found[0], found[1])
+    assert abs(found[2] - found[1]).max() > 1e-3
+
+
+REFUSED: dict[str, tuple[dict[str, Any], str]] = {
+    "level": ({"action": "rates"}, "action: expected rotors for the firmware's motors, got rates"),
+    "number": (
+        {"env_id": "rotorgram/Waypoints-v0"},
+        "observation: expected numbers that the Crazyflie's firmware knows, "
+        "got 'point after - position x'",
+    ),
+    "past": ({"history": 2}, "got 'goal - position x, 1 step ago'"),
+    "curve": ({"effects": {"thrust_curve": True}}, "as the firmware's, got thrust_curve"),
+    "craft": ({"vehicle": "heavy_hexa"}, "vehicle: expected four rotors that turn as the"),
+}
+
+
+@pytest.mark.parametrize("case", REFUSED)
+def test_what_the_firmware_cannot_do_is_refused_by_name(case: str) -> None:
+    keywords, sentence = REFUSED[case]
+    with pytest.raises(InputError) as error:
+        app(checkpoint_of(**keywords))
+    assert sentence in str(error.value)
+
+
+def test_a_control_period_of_part_of_a_millisecond_is_refused() -> None:
+    checkpoint = checkpoint_of()
+    spec = replace(checkpoint.spec, control_period=0.0125)
+    with pytest.raises(InputError, match=r"a whole number of milliseconds, got 0.0125 s$"):
+        app(replace(checkpoint, spec=spec))
+
+
+def test_a_policy_of_an_unknown_vehicle_is_refused() -> None:
+    with pytest.raises(InputError, match="one vehicle of this machine"):
+        app(replace(checkpoint_of(), env=None))
+
+
+def test_the_command_writes_a_new_folder(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = tmp_path / "policy.safetensors"
+    store(checkpoint_of().policy_alone(), file)
+    out = tmp_path / "app"
+    words = ["export", str(file), "--to", "crazyflie", "-o", str(out)]
+    assert main(words) == 0
+    # 19 inputs, 16 units, 4 thrusts: 19 · 16 + 16 · 4; biases, and 4 · 4 numbers of the action.
+    assert capsys.readouterr().out == (
+        f"app: {out} (6 files)\n"
+        "policy: 368 products and 16 tanh a call, 1,616 bytes of constants, "
+        "80 bytes of the stack\n"
+    )
+    files = app(load(file))
+    assert {one.name: one.read_bytes() for one in out.iterdir()} == files
+    assert b"SPDX-License-Identifier: MIT" in files["Makefile"] + files["rotorgram_controller.c"]
+    assert main(words) == 1
+    assert "out: expected a new folder" in capsys.readouterr().err
+
+
+def test_the_header_has_the_numbers_of_the_rotors() -> None:
+    header = app(checkpoint_of())["rotorgram_policy.h"].decode()
+    each = ", ".join(["0.0662175f"] * 4)
+    for line in (
+        "#define ROTORGRAM_ROTORS 4\n",
+        f"#define ROTORGRAM_HOVER {{{each}}} /* N */\n",
+        "#define ROTORGRAM_LEAST {0.0f, 0.0f, 0.0f, 0.0f} /* N */\n",
+        "#define ROTORGRAM_LARGEST {0.15916628f, ",
+        f"#define ROTORGRAM_INITIAL {{{each}}} /* N: ",
+        "#define ROTORGRAM_POSITIONS {0.03252691f, -0.03252691f, 0.0f, -0.03252691f, ",
+        "#define ROTORGRAM_TURNS {1, -1, 1, -1} ",
+        "#define ROTORGRAM_LAGS {0.072f, 0.072f} ",
+        "#define ROTORGRAM_GOAL {0, 1, 2} /* elements of the observation: goal - position x, ",
+    ):
+        assert line in header
+    without = app(checkpoint_of(effects={}))["rotorgram_policy.h"].decode()
+    assert "#define ROTORGRAM_LAGS {0.0f, 0.0f} " in without
+
+
+def test_the_first_thrust_carries_the_payload() -> None:
+    from rotorgram.agents.export import rotors_of
+
+    env = EnvConfig.from_keywords(
+        "rotorgram/PayloadHover-v0", vehicle="crazyflie2", payload_share=0.2
+    )
+    np.testing.assert_allclose(rotors_of(env)["initial"], [1.2 * HOVER] * 4, rtol=1e-6)
