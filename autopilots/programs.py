@@ -3,7 +3,6 @@
 import os
 import shlex
 import shutil
-import signal
 import socket
 import subprocess
 import weakref
@@ -18,7 +17,6 @@ from ..udp.protocol.errors import PeerClosed, PeerSilent
 HOST = "127.0.0.1"
 ANSWER = 5.0
 """Longest time for an answer, s."""
-_STOP = 3.0  # s, from asking a program to end to killing it
 _LOG = "output.txt"
 
 
@@ -142,12 +140,8 @@ def bound_socket(name: str, port: int) -> socket.socket:
 
 
 def _stop(process: subprocess.Popen[bytes]) -> None:
-    process.send_signal(signal.SIGTERM)
-    try:
-        process.wait(_STOP)
-    except subprocess.TimeoutExpired:
-        process.kill()
-        process.wait()
+    process.kill()  # one that waits for its simulator takes no other signal
+    process.wait()
 
 
 def compiled(source: Path, folder: Path) -> Path:

@@ -73,6 +73,9 @@ class Propellers:
         hover = float(vehicle.hover_thrust.sum() / vehicle.thrust_high.sum())
         self.hover = self.throttle(hover)
         self.slope: Floats = self._high * self._own.deriv()(self.hover)
+        bend = self._throttles * (self._throttles - 1.0)
+        over = self._shares - self._throttles
+        self.expo = float(bend @ over / (bend @ bend))
 
     def commands(self, throttles: Floats) -> Floats:
         """Commands of the rotors, N, at throttles from 0 to 1, shape (R,)."""

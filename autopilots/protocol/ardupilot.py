@@ -20,6 +20,8 @@ PORT: Final = 9002
 _HEADER = struct.Struct("<HHI")
 _CHANNELS = {18458: 16, 29569: 32}
 _LOW, _HIGH = 1000.0, 2000.0  # µs
+FIRST: Final = 0.001
+"""Time stamp of the first state, s: at 0 the program takes the time of its computer."""
 
 
 class Servos(NamedTuple):
@@ -47,7 +49,7 @@ def servos(datagram: bytes) -> Servos:
 def state_line(reading: Reading) -> bytes:
     """What its sensors and its estimate begin from."""
     state = {
-        "timestamp": reading.time,
+        "timestamp": reading.time + FIRST,
         "imu": {
             "gyro": forward_right_down(reading.rates),
             "accel_body": forward_right_down(reading.specific_force),

@@ -1,0 +1,205 @@
+"""ArduCopter in the seat: its program (SITL) by the JSON interface, told where to fly by MAVLink.
+
+Its clock is ours from the first step on: the flight has the same bits each time.
+"""
+
+import math
+import tomllib
+from contextlib import suppress
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+
+from ..agents.policies import Observation
+from ..models import InputError, Vehicle
+from ..models.errors import require
+from ..sim.control.gains import Gains
+from .programs import HOST, Program
+from .protocol import ardupilot as protocol
+from .reading import Floats, Order, Propellers, Reading
+from .seat import Start
+
+PERIOD: Final = 0.01
+"""Time that its filters and its loop need, s."""
+MOST_ACCELERATION: Final = 5.0
+"""Largest horizontal acceleration on the way to a goal, m/s²."""
+TALK_EVERY: Final = 20
+"""Steps between two messages to it."""
+ASK_EVERY: Final = 400
+"""Steps between two requests for reports of its estimate, until they say that it is ready."""
+_TABLES: Final = tomllib.loads(Path(__file__).with_suffix(".toml").read_text())
+_NEAR: Final = 25.0  # °: between a rotor and the place of its motor
+_OPTIONS: Final = (
+    "--serial1=none:0",
+    "--serial2=none:0",
+    "--defaults=vehicle.parm",
+    "--speedup=1000",
+    "--home=47.377,8.542,0,0",
+    "--start-time=1700000000",  # GPS tells it the time
+)
+_MODE, _ARM, _TAKE_OFF, _SEND_EVERY = 176, 400, 22, 511  # MAV_CMD
+_GUIDED, _FORCED = 4, 21196
+_REPORT: Final = 193  # EKF_STATUS_REPORT
+_READY: Final = 1 | 2 | 4 | 8 | 16  # attitude, velocities, position
+_POSITION_AND_YAW: Final = 0b100111111000
+
+
+def motor_order(vehicle: Vehicle) -> tuple[int, int, list[int]]:
+    """FRAME_CLASS, FRAME_TYPE, and the rotor at the place of each motor. Raises `InputError`."""
+    x, y, _ = np.array([rotor.position for rotor in vehicle.rotors]).T
+    places = np.degrees(np.arctan2(-y, x))
+    turns = np.sign([rotor.reaction[2] for rotor in vehicle.rotors])
+    for frame in _TABLES["frames"]:
+        angles = np.array(frame["angles"])
+        off = (places - angles[:, np.newaxis] + 180.0) % 360.0 - 180.0
+        same_turn = turns == np.array(frame["turns"])[:, np.newaxis]
+        matches = (np.abs(off) < _NEAR) & same_turn
+        if len(angles) == len(places) and matches.any(axis=1).all():
+            return frame["class"], frame["type"], matches.argmax(axis=1).tolist()
+    raise InputError(
+        "ardupilot: expected a quadcopter or a hexacopter, X or plus, with its turn directions, "
+        f"got {vehicle.name} with rotors at {places.round().tolist()}° from the nose"
+    )
+
+
+def tuning(vehicle: Vehicle, propellers: Propellers) -> dict[str, float]:
+    """Parameters of a vehicle: its loops are as fast as those of our own control levels."""
+    lag = vehicle.coefficients["rotors.time_constant"] or 0.0
+    gains = Gains.of(vehicle, PERIOD, lag)
+    hover = float(vehicle.hover_thrust.sum() / vehicle.thrust_high.sum())
+    acceleration = min(MOST_ACCELERATION, gains.most_acceleration[0] / 2.0)
+    levers = vehicle.allocation[1:]
+    torques = levers**2 @ vehicle.thrust_high / np.abs(levers).max(axis=1)
+    found: dict[str, float] = {
+        "MOT_THST_HOVER": hover,
+        "MOT_THST_EXPO": propellers.expo,
+        "PSC_ACCZ_P": hover,
+        "PSC_ACCZ_I": 2.0 * hover,
+        "PSC_POSXY_P": gains.position,
+        "PSC_VELXY_P": gains.velocity,
+        "PSC_VELXY_I": gains.velocity / 5.0,
+        "WPNAV_ACCEL": 100.0 * acceleration,  # cm/s²
+    }
+    angle_gains = (gains.attitude, gains.attitude, gains.heading)
+    for axis, name in enumerate(("RLL", "PIT", "YAW")):
+        turned = torques[axis] / vehicle.inertia[axis, axis] / 2.0  # rad/s² at its largest output
+        p = gains.rate[axis] / turned
+        found |= {
+            f"ATC_ANG_{name}_P": angle_gains[axis],
+            f"ATC_RAT_{name}_P": p,
+            f"ATC_RAT_{name}_I": p * gains.attitude / 5.0,
+            f"ATC_RAT_{name}_D": p * lag * 2.0 / 3.0,
+            f"ATC_ACCEL_{name[0]}_MAX": 100.0 * math.degrees(hover * turned),  # 0.01°/s²
+        }
+    return found
+
+
+class ArduPilot:
+    """A program of ArduCopter's SITL. Its ports are free ones: many run side by side."""
+
+    def __init__(self, start: Start) -> None:
+        config, vehicle, _, program, _ = start
+        self._mavlink = require("pymavlink.dialects.v20.ardupilotmega", "autopilot", "ardupilot")
+        self._mav = self._mavlink.MAVLink(None, srcSystem=255)
+        self._mav.robust_parsing = True
+        frame_class, frame_type, self._order = motor_order(vehicle)
+        frame = {"FRAME_CLASS": frame_class, "FRAME_TYPE": frame_type}
+        values = _TABLES["parameters"] | frame | tuning(vehicle, Propellers(config, vehicle))
+        self._steps = 0
+        self._origin: Floats | None = None
+        self._commands = [
+            (_MODE, 1, _GUIDED),
+            (_ARM, 1, _FORCED),
+            (_TAKE_OFF, 0, 0, 0, 0, 0, 0, 1),
+        ]
+        self.ready = False
+        self.why = "its estimate has not begun"
+        self.late = 0
+        self._program = Program("ardupilot", 0)
+        self._talk = self._program.listen(0)
+        self._talk.setblocking(False)
+        self._heard = False
+        lines = [f"{name} {value:.6g}\n" for name, value in values.items()]
+        (self._program.folder / "vehicle.parm").write_text("".join(lines))
+        ports = [link.getsockname()[1] for link in (self._program.link, self._talk)]
+        self._program.start(
+            program,
+            [
+                f"--model=JSON:{HOST}",
+                f"--sim-port-out={ports[0]}",
+                f"--serial0=udpclient:{HOST}:{ports[1]}",
+                *_OPTIONS,
+            ],
+        )
+        self._frame = -1
+        self._receive()
+
+    def step(self, reading: Reading, order: Order | None, observation: Observation) -> Floats:
+        """As `Stack.step`."""
+        if self._origin is None:
+            self._origin = reading.position
+        if self._steps % TALK_EVERY == 0:
+            self._listen()
+            if self._heard:
+                self._tell(order, self._origin)
+        self._steps += 1
+        self._program.send(protocol.state_line(reading))
+        throttles = np.zeros(len(self._order))
+        throttles[self._order] = self._receive()[: len(self._order)]
+        return throttles
+
+    def _receive(self) -> Floats:
+        """Throttles of the next frame. A frame comes again after a second of silence."""
+        while True:
+            servos = protocol.servos(self._program.receive())
+            if servos.frame > self._frame:
+                break
+        self.late += servos.frame > self._frame + 1
+        self._frame = servos.frame
+        return servos.throttles
+
+    def _listen(self) -> None:
+        """Take its messages."""
+        data = b""
+        with suppress(BlockingIOError):
+            while True:
+                datagram, there = self._talk.recvfrom(2048)
+                self._talk.connect(there)
+                data += datagram
+                self._heard = True
+        for message in self._mav.parse_buffer(data) or ():
+            match message.get_type():
+                case "STATUSTEXT":
+                    self.why = message.text
+                case "EKF_STATUS_REPORT":
+                    self.ready = message.flags & _READY == _READY
+                case "COMMAND_ACK" if self._commands:
+                    waits_for, *_ = self._commands[0]
+                    if message.command == waits_for and message.result == 0:
+                        del self._commands[0]
+
+    def _tell(self, order: Order | None, origin: Floats) -> None:
+        """One message: a command until it is accepted, then the goal."""
+        if not self.ready and self._steps % ASK_EVERY == 0:
+            self._command(_SEND_EVERY, _REPORT, 100_000)
+        elif order is not None and self._commands:
+            self._command(*self._commands[0])
+        elif order is not None and not order.stands:
+            goal = protocol.north_east_down(order.goal - origin)
+            yaw = math.pi / 2 - order.heading
+            moves = [0.0] * 6
+            fields = (0, 1, 1, 1, _POSITION_AND_YAW, *goal, *moves, yaw, 0)
+            self._send("set_position_target_local_ned", *fields)
+
+    def _command(self, number: int, *values: int) -> None:
+        filled = (*values, *[0] * 7)[:7]
+        self._send("command_long", 1, 1, number, 0, *filled)
+
+    def _send(self, name: str, *fields: float) -> None:
+        message = getattr(self._mavlink, f"MAVLink_{name}_message")(*fields)
+        self._talk.send(message.pack(self._mav))
+
+    def close(self) -> None:
+        """As `Stack.close`."""
+        self._program.close()
