@@ -126,6 +126,9 @@ class EnvFlags(Command):
     sensors: Words = ()
     """Sensors whose readings are observed, each NAME or NAME=SETTINGS: imu gps={"rate":10}, and
     observe=estimate. docs/sensors.md lists them."""
+    events: Annotated[str | None, arg(metavar="FILE")] = None
+    """TOML file of what happens in flight: a gust, a kick, a rotor that fails. docs/events.md has
+    the kinds."""
     drones: Count = 1
     """Drones of each world, for a task of several."""
     backend: Backend | None = None

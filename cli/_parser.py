@@ -24,7 +24,15 @@ from ._flags import (
 )
 
 T = TypeVar("T")
-_PLAIN_FLAGS = ("action", "control_period", "episode_length", "history", "scene", "cameras")
+_PLAIN_FLAGS = (
+    "action",
+    "control_period",
+    "episode_length",
+    "history",
+    "scene",
+    "cameras",
+    "events",
+)
 _NAMED_FLAGS = ("effects", "randomize", "sensors")
 _OPTIONS = (
     "Options of the task that --env names. A checkpoint brings those that it was trained with."

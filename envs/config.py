@@ -34,6 +34,7 @@ from ..scenes.returns import RANGES
 from ..sim import EffectOptions, Randomization
 from ..sim.effects import NO_EFFECTS
 from . import registry
+from .events import changes_of, check_events, read_events
 from .spec import Values, canonical_id, json_values
 
 if TYPE_CHECKING:
@@ -122,6 +123,8 @@ class EnvConfig:
     NAME@WIDTHxHEIGHT."""
     backend: BackendConfig = None  # type: ignore[assignment]  # as the scene
     """None given: the task's, `mujoco` for most."""
+    events: tuple[Values, ...] = field(default=(), hash=False)
+    """What happens in flight: a table for each event, as of `events.toml`; or a TOML file."""
     files: Options = field(default_factory=dict, hash=False, repr=False)
     """Content of the files of `vehicle` by their names, as `models/bundle` has it; set by
     `resolve`, which needs the files themselves no more."""
@@ -147,6 +150,7 @@ class EnvConfig:
             vehicle=vehicle_words(self.vehicle),
             cameras=words_of("cameras", self.cameras),
             randomize=Randomization(self.randomize, None).to_options(),
+            events=read_events(self.events),
         )
         if self.files:
             from ..models.bundle import checked_bundles
@@ -247,6 +251,8 @@ class EnvConfig:
         """All fields as JSON values, with the version."""
         content = {"version": VERSION, **vars(self), "effects": self.effects.to_options()}
         content |= {"scene": asdict(self.scene), "backend": asdict(self.backend)}
+        if not self.events:
+            content.pop("events")
         return json_values(content)
 
     @classmethod
@@ -287,8 +293,12 @@ class EnvConfig:
 
     @property
     def drawn(self) -> Randomization:
-        """What is drawn for each episode. Raises `InputError` where its effect is off."""
-        return Randomization(self.randomize, self.effects)
+        """What is drawn for each episode, and what events change within one. Raises `InputError`
+        where its effect is off.
+        """
+        changes = changes_of(self.events, self.control_period or 1.0)
+        most = {name: float(change.sum()) for name, change in changes.items()}
+        return Randomization(self.randomize, self.effects, most)
 
     @property
     def vehicle_paths(self) -> tuple[str, ...]:
@@ -354,7 +364,8 @@ class EnvConfig:
             used = ", ".join(getattr(self, name))
             if several and used:
                 raise InputError(f"{name}: expected none with several vehicles, got {used}")
-        randomize = Randomization(self.randomize, None)
+        check_events(self)
+        randomize = self.drawn
         settings = self.backend.settings
         _, hidden = solids_around(vehicle, whole.scene)
         check_world(vehicle, self.backend.name, self.effects, randomize, settings, hidden)
@@ -394,7 +405,7 @@ _DEFAULTS = ("vehicle", "sensors", "backend")
 _FROM_TASK = ("action", "control_period", "episode_length")
 _OPTIONS = (
     "episode_length", "action", "control_period", "history", "effects", "randomize", "sensors",
-    "cameras",
+    "cameras", "events",
 )  # fmt: skip
 BACKEND_KEYWORDS = ("num_threads", "dtype", "compiled")
 """Keywords that are settings of the backend."""

@@ -79,7 +79,9 @@ class Machine:
         self._told = Layout(fields_of(self._telemetry()), lanes)
         given: Named = dict.fromkeys(_MASKS, (_BOOL, sent.shape[1:-1]))
         given["sent"] = (sent.dtype, sent.shape[1:])
-        given |= fields_of(world.scenery.shared()) | fields_of(self._pushed())
+        pushed = self._pushed()
+        self._acts = tuple(pushed)
+        given |= fields_of(world.scenery.shared()) | fields_of(pushed)
         given |= fields_of({_PHYSICS + name: x for name, x in seen.items()})
         self._outside = given | fields_of(self._seen())
         self._layouts = layout, self._told
@@ -206,15 +208,13 @@ class Machine:
         """Fly by physics that is no array code."""
         world = self._world
         worlds = self._worlds
-        acting = self._given["acting"][:worlds]
-        wrench = self._given.get("wrench")
+        acts = {name: self._given[name][:worlds] for name in self._acts}
         for code, call in self._calls:
             if code:
                 if code != _FIRST:
                     self._take(world.told(asked=False))
                 self._call(code)
-                world.acting = acting
-                world.wrench = None if wrench is None else wrench[:worlds]
+                vars(world).update(acts)
             world.fly(call, flown)
 
     def _begin(self, begun: Mask) -> None:
@@ -308,7 +308,7 @@ class Machine:
         world = self._loop.world
         if not world.is_apart:
             return {}
-        pushed = {"acting": world.acting, "wrench": world.wrench}
+        pushed = {"acting": world.acting, "wrench": world.wrench, "load": world.load}
         return {name: array for name, array in pushed.items() if array is not None}
 
     def _variables(self, program: Program) -> Named:

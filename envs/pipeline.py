@@ -9,6 +9,7 @@ from .specification import observed
 from .stages.actions import ActionDelay, Receive
 from .stages.clock import Clock
 from .stages.ends import Ends
+from .stages.events import Events
 from .stages.flight import Control, Flight, StandStill
 from .stages.history import History, ObservationDelay
 from .stages.judge import Judge, Remember, Starts
@@ -55,9 +56,10 @@ class Pipeline:
         often = getattr(controller, "every_step", False) and not config.estimated
         held = 1 if often else substeps
         parts: list[Stage] = [Control(controller, look)]
-        if world.shape[1] > 1:
+        if world.shape[1] > 1 or "link_off" in randomize.names:
             vehicle = task.vehicle
-            parts.append(StandStill(np.clip(0.0, vehicle.thrust_low, vehicle.thrust_high)))
+            rest = np.clip(0.0, vehicle.thrust_low, vehicle.thrust_high)
+            parts.append(StandStill(world, rest))
 
         flying: list[Stage] = [Receive(neutral)]
         if "action_delay" in randomize.names:
@@ -65,6 +67,7 @@ class Pipeline:
         self.flight = flight = Flight(world, parts, substeps, held)
         flying += [Clock(), flight]
 
+        events = [Events(task, world)] if config.events else []
         observing = self._observing(task, world, sensors)
         if "observation_delay" in randomize.names:
             longest = randomize.most_steps("observation_delay")
@@ -73,10 +76,10 @@ class Pipeline:
             observing.append(History(config.history))
         observing.append(Ends(config.env_id, task.episode_length))
 
-        self.stages = [Starts(task, world), *flying, *observing]
-        self.fly = [stage.step for stage in flying]
+        self.stages = [Starts(task, world), *flying, *events, *observing]
+        self.fly = [*[stage.act for stage in events], *[stage.step for stage in flying]]
         self.begin = [stage.begin for stage in self.stages]
-        self.observe = [stage.step for stage in observing]
+        self.observe = [stage.step for stage in (*observing, *events)]
         self.before = [*self.fly[:-1], flight.control]
         self.set_out = []
         self.sense = []

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..sim.state import FAR, Array, WorldState
+from ..sim.state import FAR, Array, ByName, WorldState
 
 
 @dataclass(kw_only=True, slots=True)
@@ -25,6 +25,8 @@ class State(WorldState):
     distance: Callable[[Array], Array]
     """From points, world frame, m, (W, n, 3), to the nearest solid but level ground of each world,
     m, (W, n): as `clearance`, without the sphere."""
+    parameters: ByName
+    """What is drawn for the episode and what events have changed, by name, shape (W, A)."""
     neighbours: NDArray[np.float64] | None = None
     """What each drone has heard of its neighbours, see `stages/radio.py`: shape (W, A, k, 7)."""
 

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ..sim import PARAMETERS
+from ..sim.randomize import CHANGE
 from ..sim.state import Array, ByName, stack
 from .spec import BODY, BODY_TO_WORLD, WORLD, ArraySpec, Bound
 from .tasks.task import Task
@@ -75,7 +76,7 @@ def quantities_of(task: Task) -> list[Quantity]:
         quantities.append(Quantity("wind", winds, "m/s", _wind, WORLD))
     if drawn:
         names = tuple(f"drawn_{name}" for name in drawn)
-        units = tuple(PARAMETERS[name].unit for name in drawn)
+        units = tuple(PARAMETERS.get(name, CHANGE).unit for name in drawn)
         quantities.append(Quantity("drawn", names, units, _drawn))
     if effects.payload:
         names = ("payload_x", "payload_y", "payload_z")
@@ -124,7 +125,7 @@ def _wind(loop: "Loop") -> Array:
 
 def _drawn(loop: "Loop") -> Array:
     drawn = loop.world.parameters
-    return stack([drawn[name] for name in PARAMETERS if name in drawn])
+    return stack([drawn[name] for name in loop.world.randomize.names])
 
 
 def _layout(loop: "Loop") -> Array:

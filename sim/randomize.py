@@ -5,7 +5,7 @@ A parameter is a factor of the vehicle's own value, 1 being that value, or a num
 
 import math
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -38,8 +38,10 @@ _TABLES = read_own_toml(__file__, "parameters")
 PARAMETERS = {name: Parameter(**table) for name, table in _TABLES.items()}
 """What can be drawn, by name."""
 CENTER = ("center_x", "center_y", "center_z")
+LEAST_MASS = 0.1  # share of a mass that is left under any load
 WHOLE = ("action_delay", "observation_delay")
 """Parameters that are whole numbers; a uniform draw gives each the same chance."""
+CHANGE = Parameter(-math.inf, math.inf, "1", "what only changes within an episode; 0 before")
 _FORMS = "uniform(low,high), loguniform(low,high), normal(mean,deviation)"
 _TEXT = re.compile(r"\s*([a-z]+)\s*\(([^()]*)\)\s*")
 
@@ -50,25 +52,37 @@ class Randomization:
     `uniform(low, high)`, `loguniform(low, high)` and `normal(mean, deviation)`; a number stands for
     itself. Raises `InputError` for anything else, and for a parameter whose effect is off. Effects
     None: this is not checked.
+
+    `changing`: by how much parameters grow at most within an episode. Those that are not drawn
+    begin at the vehicle's own value; they move no random number of the others.
     """
 
-    def __init__(self, texts: object, effects: EffectOptions | None) -> None:
+    def __init__(
+        self,
+        texts: object,
+        effects: EffectOptions | None,
+        changing: Mapping[str, float] | None = None,
+    ) -> None:
+        self._changing = changing or {}
         self._kinds: dict[str, tuple[str, tuple[float, ...]]] = {}
         given = mapping(texts, "randomize", "a mapping from names to distributions")
         check_names(given, PARAMETERS, "randomize")
         for name, text in given.items():
-            needs = PARAMETERS[name].needs
+            self._kinds[name] = _distribution(name, text)
+        for name in (*given, *self._changing):
+            needs = PARAMETERS.get(name, CHANGE).needs
             if needs and effects and not any(getattr(effects, effect) for effect in needs):
+                where = "randomize" if name in given else "events"
                 raise InputError(
-                    f"randomize: {name}: expected the effect {' or '.join(needs)}, "
+                    f"{where}: {name}: expected the effect {' or '.join(needs)}, "
                     "got it switched off"
                 )
-            self._kinds[name] = _distribution(name, text)
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Names of what is drawn, in the order of `PARAMETERS`."""
-        return tuple(name for name in PARAMETERS if name in self._kinds)
+        """Names of what is drawn, in the order of `PARAMETERS`, and of what else changes."""
+        drawn = [name for name in PARAMETERS if name in self._kinds]
+        return (*drawn, *[name for name in self._changing if name not in self._kinds])
 
     def to_options(self) -> dict[str, float | str]:
         """The distributions by name in canonical form: a number, or a text."""
@@ -80,16 +94,18 @@ class Randomization:
         return options
 
     def most_steps(self, name: str) -> int:
-        """Longest delay that can be drawn, control steps; 0 where none is."""
+        """Longest delay that can be, control steps; 0 where none is."""
         kind, numbers = self._kinds.get(name, ("", (0.0,)))
-        return round(PARAMETERS[name].high if kind == "normal" else max(numbers))
+        drawn = PARAMETERS[name].high if kind == "normal" else max(numbers)
+        return round(drawn + self._changing.get(name, 0.0))
 
     def draw(self, draw: Draw) -> ByName:
         """Values by name, shape (W, A)."""
         drawn = {}
         for name in self.names:
-            kind, numbers = self._kinds[name]
-            limits = PARAMETERS[name]
+            limits = PARAMETERS.get(name, CHANGE)
+            own = 0.0 if limits.unit else 1.0
+            kind, numbers = self._kinds.get(name, ("uniform", (own, own)))
             if kind == "normal":
                 values = numbers[0] + draw.normal(numbers[1])
             elif kind == "loguniform":

@@ -17,9 +17,9 @@ from ..scenes.config import refuse_hidden
 from .compile.llvm import trouble
 from .effects import NO_EFFECTS, EffectOptions, Effects
 from .random import RANDOMIZATION, START, Draw, Random
-from .randomize import FIXED, Randomization
+from .randomize import CHANGE, FIXED, PARAMETERS, Randomization
 from .snapshots import Arrays, Kept, Snapshot, joined, part_of
-from .state import FAR, Array, ByName, InitialState, WorldState, chosen
+from .state import FAR, Array, ByName, InitialState, WorldState, chosen, clip
 
 if TYPE_CHECKING:
     from .scenery import Scenery
@@ -70,11 +70,13 @@ class World(Kept, NotCopied):
         state: As the last step or reset left it.
         randomize: What is drawn for each episode.
         random: The counters of all random numbers; `seed` seeds them.
-        parameters: What was drawn for each drone's episode, by name, shape (W, A).
+        drawn: Parameters that were drawn for each drone's episode, by name, shape (W, A).
+        parameters: Those that are flown with: `change` may differ from the drawn ones.
         scenery: What stands around the drones.
         effects: What acts on drones besides gravity, contact and ideal rotors.
         acting: Mean thrust of each rotor over the last physics step, N, shape (W, A, R).
         wrench: Mean force and torque of the air over it, as of `Effects.step`; None: no air.
+        load: The parameter of this name, for physics that is no array code; None: it never changes.
         bad: Drones with a state that is bad, where the physics is array code, bool, (W, A).
         outer: What other physics says, by name, in code that is being compiled; otherwise empty.
         asked: Names of what sensors asked of it.
@@ -88,6 +90,7 @@ class World(Kept, NotCopied):
 
     acting: Array
     wrench: Array
+    load: Array = None
 
     def __init__(
         self,
@@ -101,6 +104,7 @@ class World(Kept, NotCopied):
         self.vehicle = vehicle
         self.shape = shape
         self.scenery = scenery
+        self.drawn: ByName = {}
         self.parameters: ByName = {}
         self._options = effects
         self.randomize = randomize
@@ -203,6 +207,19 @@ class World(Kept, NotCopied):
             acting = self._limited(acting)
         self.acting = chosen(mask, self._typed(acting), self.acting)
 
+    def change(self, changes: ByName) -> None:
+        """Fly on with parameters that differ by this much from the drawn ones, by name, (W, A).
+
+        They stay within their limits.
+        """
+        parameters = {**self.drawn}
+        for name, change in changes.items():
+            limits = PARAMETERS.get(name, CHANGE)
+            parameters[name] = clip(parameters[name] + change, limits.low, limits.high)
+        self.parameters = parameters
+        self.effects.take(parameters)
+        self._vary(parameters)
+
     def acceleration(self) -> Array:
         """Of each body's origin at the present state and thrusts, world frame, m/s², (W, A, 3)."""
         raise NotImplementedError
@@ -231,14 +248,15 @@ class World(Kept, NotCopied):
     def snapshot(self) -> Snapshot:
         """Copies of all arrays that a later step depends on, by name."""
         state = {name: getattr(self.state, name) for name in self.of_state}
-        own: ByName = {"state": state | self.hidden(), "parameters": self.parameters}
+        own: ByName = {"state": state | self.hidden(), "parameters": self.drawn}
         return super().snapshot() | joined(own)
 
     def restore(self, arrays: Arrays) -> None:
         """Put a snapshot back; no step runs. No later bit differs from those that followed it."""
         arrays = {name: array.copy() for name, array in arrays.items()}
         super().restore(arrays)
-        self.parameters = part_of(arrays, "parameters")
+        self.drawn = part_of(arrays, "parameters")
+        self.parameters = {**self.drawn}
         self.effects.take(self.parameters)
         self._vary(self.parameters)
         state = part_of(arrays, "state")
@@ -295,8 +313,8 @@ class World(Kept, NotCopied):
         if self._drawn:
             draw = Draw(self.random, RANDOMIZATION, mask)
             for name, new in self.randomize.draw(draw).items():
-                old = self.parameters.get(name)
-                self.parameters[name] = new if old is None else np.where(mask, new, old)
+                self.drawn[name] = chosen(mask, new, self.drawn.get(name))
+                self.parameters[name] = chosen(mask, new, self.parameters.get(name))
 
     def _begun(self, mask: Array, pose: InitialState) -> ByName:
         """The pose's arrays by their names; those of the state for worlds out of the mask."""

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ...sim import World
-from ...sim.state import filled, pushed, taken
+from ...sim.state import chosen, filled, pushed, taken
 from .record import Floats, Record, Stage
 
 
@@ -29,7 +29,10 @@ class Receive(Stage):
 
 @dataclass
 class ActionDelay(Stage):
-    """An action takes effect late by a number of control steps that each episode draws."""
+    """An action takes effect late by a number of control steps that each episode draws.
+
+    While the link is out, no action arrives: the drone flies by the last one that did.
+    """
 
     arrays = ("actions_sent",)
 
@@ -46,5 +49,9 @@ class ActionDelay(Stage):
 
     def step(self, record: Record) -> None:
         """The action that was sent as long ago as the delay."""
-        record.actions_sent = sent = pushed(record.actions_sent, record.received)
-        record.received = taken(sent, self.world.parameters["action_delay"])
+        parameters = self.world.parameters
+        sent = pushed(record.actions_sent, record.received)
+        if "link_hold" in parameters:
+            sent = chosen(parameters["link_hold"] > 0, record.actions_sent, sent)
+        record.actions_sent = sent
+        record.received = taken(sent, parameters["action_delay"])

@@ -86,11 +86,16 @@ class Control(Stage):
 
 @dataclass
 class StandStill(Stage):
-    """Rotors of drones whose own episode has ended stand still, while the others fly on."""
+    """Rotors of drones whose own episode has ended stand still, while the others fly on, and so do
+    those that are stopped.
+    """
 
+    world: World
+    """Its parameter `link_off`, where there is one."""
     rest: np.ndarray
     """Thrust of a rotor that stands still, N, (R,)."""
 
     def step(self, record: Record) -> None:
         """The thrust next to 0."""
-        record.thrust = np.where(record.out[..., None], self.rest, record.thrust)
+        still = record.out | (self.world.parameters.get("link_off", 0.0) > 0)
+        record.thrust = np.where(still[..., None], self.rest, record.thrust)

@@ -38,6 +38,7 @@ class Measure(Stage):
             time=steps * self.period,
             known_clearance=self.world.clearance(),
             distance=self.world.scenery.distance,
+            parameters=self.world.parameters,
         )
         record.measured = record.state
 

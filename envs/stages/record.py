@@ -51,6 +51,7 @@ class Record:
         done: Drones of worlds whose episodes have all ended, (W, A).
         waiting: Drones that must be reset before they fly, (W, A).
         actions_sent, past_observations, history: Of the last steps, the oldest first.
+        fired: Control step after which each event happened, infinite before, (W, A, E).
         said, heard, age, keys, silent: Of the radio; see `Radio`.
     """
 
@@ -69,6 +70,7 @@ class Record:
     terms: ByName
     metrics: ByName
     ended: Array
+    fired: Floats
     said: Floats
     heard: Floats
     age: Floats

@@ -41,6 +41,7 @@ COURSE_WORST_RATES = -COURSE_RATE_WEIGHT * FASTEST_COUNTED
 COURSE_WORST_STEP = -0.05  # Of a course: a hundredth of the cost of a crash
 LEAST_TILT_COSINE = 0.0
 """Cosine of the tilt (90°) past which the craft counts as flipped over."""
+SHIFT = ("goal_x", "goal_y", "goal_z")  # parameters of events that move a goal
 AIR = 0.6  # Least room under a craft that starts, m
 FURTHEST = 1e4  # Furthest goal, m
 MAX_SPEED = 100.0  # Speed past which an observation is clipped, m/s
@@ -169,8 +170,10 @@ class GoalTask(Task):
         return ()
 
     def goal(self, state: State) -> Array:
-        """The option `goal`, the same for every drone."""
-        return at(self.options.goal, state.position[..., 0])
+        """The option `goal`, the same for every drone, moved by events."""
+        goal = at(self.options.goal, state.position[..., 0])
+        way = [state.parameters[name] for name in SHIFT if name in state.parameters]
+        return goal + stack(way) if way else goal
 
     def offset(self, draw: Draw) -> Array:
         """Of a start, within the option `start_band` along each axis, m, (W, A, 3)."""

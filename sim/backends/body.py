@@ -19,7 +19,7 @@ import numpy as np
 from ...models import matrices
 from ...models.vehicle import Vehicle
 from .. import elementary
-from ..randomize import CENTER
+from ..randomize import CENTER, LEAST_MASS
 from ..rotations import product, transposed
 from ..state import Array
 
@@ -122,9 +122,12 @@ class RigidBody:
         mass, center = self._least
         factor = parameters.get("mass", 1.0)
         turn, gyroscopic = self._of_inertia if inertia is None else _euler(inertia)
+        whole = mass * factor
+        if "load" in parameters:
+            whole = np.maximum(whole + parameters["load"], LEAST_MASS * whole)
         shift: Vector = tuple(parameters.get(name, 0.0) for name in CENTER)
         self.varying = Varying(
-            mass=mass * factor,
+            mass=whole,
             easier=1.0 / factor / parameters.get("inertia", 1.0),
             turn=turn,
             gyroscopic=gyroscopic,

@@ -27,7 +27,7 @@ from ...scenes.geoms import NAME, add_fields, add_solids, fields_of, geoms_of
 from ...scenes.kernels import HFIELD
 from ...scenes.solids import Solids
 from ..effects import EffectOptions
-from ..randomize import CENTER, Randomization
+from ..randomize import CENTER, LEAST_MASS, Randomization
 from ..rotations import body_z
 from ..scenery import Scenery
 from ..snapshots import Arrays
@@ -76,6 +76,7 @@ class MujocoWorld(World):
             model = copy.copy(model)
             model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CLAMPCTRL
         self._batch = batch = Batch(model, num_worlds, threads)
+        self._loaded = np.zeros(shape)  # what the models have
         self._laid = np.full(num_worlds, -1)  # seeds of the layouts that the geoms have
         self._cable = self._options.cable if self._options.payload else None
         self._varied = WorldParameters(batch.model, self._drawn)
@@ -231,6 +232,8 @@ class MujocoWorld(World):
         self._check_process()
         ids = None if mask is None else self.random.ids(mask)
         some = ... if ids is None else ids
+        if self.load is not None:
+            self._take_load()
         if call.pushes:
             self._ctrl[some] = self.acting.reshape(self._ctrl.shape)[some] / self._newtons
             if self.wrench is not None:
@@ -257,9 +260,24 @@ class MujocoWorld(World):
         if not self._varied.base or not self.parameters:
             return
         values = {name: x[ids] for name, x in self.parameters.items()}
+        if self.load is not None:
+            self._loaded[ids] = values["load"] = self.load[ids]
+            share = values["load"] / (self.vehicle.mass * values.get("mass", 1.0))
+            values["load"] = np.maximum(1.0 + share, LEAST_MASS)
         for field, rows in self._varied.values(values).items():
             self._batch.expand(field)[ids] = rows
         self._batch.set_const(ids)
+
+    def _vary(self, parameters: ByName) -> None:
+        self.load = parameters.get("load")
+
+    def _take_load(self) -> None:
+        """Give models a load that has changed; their states stay."""
+        ids = np.flatnonzero((self.load != self._loaded).any(axis=1))
+        if len(ids):
+            states = self._batch.state[ids]
+            self._vary_models(ids)
+            self._batch.state[ids] = states
 
     def _put(self, arrays: Arrays) -> None:
         if "integration" in arrays:
@@ -393,6 +411,7 @@ class WorldParameters:
             # Unity's drag goes with the mass.
             "mass": {"body_mass": craft, "body_inertia": craft[:, None], "dof_damping": linear},
             "inertia": {"body_inertia": craft[:, None]},
+            "load": {"body_mass": craft, "dof_damping": linear},
             "payload": {"body_mass": hung, "body_inertia": hung[:, None]},
             "reaction": {"actuator_gear": torque},
         }

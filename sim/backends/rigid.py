@@ -78,11 +78,13 @@ class RigidWorld(World):
         shape = (num_worlds, drones)
         super().__init__(vehicle, shape, effects, randomize, scenery, dtype)
         _check_forces(vehicle)
-        if "inertia" in self._drawn and np.count_nonzero(owners(vehicle.model) == 0) > 1:
-            raise InputError(
-                "randomize: inertia: expected a craft of one body with the backend rigid, got "
-                f"{vehicle.name}"
-            )
+        several = np.count_nonzero(owners(vehicle.model) == 0) > 1
+        for name in ("inertia", "load"):
+            if several and name in self._drawn:
+                raise InputError(
+                    f"randomize: {name}: expected a craft of one body with the backend rigid, got "
+                    f"{vehicle.name}"
+                )
         self._body = RigidBody(vehicle)
         self._hull = Hull(vehicle)
         self._nobody = self.bad

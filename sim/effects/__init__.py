@@ -17,11 +17,11 @@ from ...models import InputError
 from ..random import GUSTS, Noise
 from ..rotations import Parts, add
 from ..snapshots import Kept
-from ..state import Array, ByName, WorldState
+from ..state import Array, ByName, WorldState, stack
 from .air import AirEffects
 from .downwash import Downwash
 from .gusts import NUMBERS, Gusts
-from .options import NO_EFFECTS, EffectOptions
+from .options import NO_EFFECTS, PUSH, EffectOptions
 from .rotors import RotorEffects
 
 __all__ = ["NO_EFFECTS", "EffectOptions", "Effects"]
@@ -53,7 +53,8 @@ class Effects(Kept):
                 raise InputError(f"randomize: expected one of the {count} rotors, got {name}")
         self.on_rotors = self.rotors.acts or bool(scaled)
         self.air = AirEffects(vehicle, options)
-        self.on_body = self.air.acts
+        self._is_pushed = not set(PUSH).isdisjoint(drawn)
+        self.on_body = self.air.acts or self._is_pushed
         self._mean_wind = options.wind
         blows = options.gusts or options.downwash or any(options.wind)
         if blows and not (options.body_drag or options.rotor_drag):
@@ -100,6 +101,8 @@ class Effects(Kept):
             self.rotors.take(factors)
         if self.on_body:
             self.air.take(factors)
+        if self._is_pushed:
+            self._push = stack([factors.get(name, 0.0) for name in PUSH])
         both = zip(self._mean_wind, "xyz", strict=True)
         self._wind = [mean + factors.get(f"wind_{axis}", 0.0) for mean, axis in both]
 
@@ -118,11 +121,12 @@ class Effects(Kept):
         root = None
         if self.on_rotors:
             mean, end, root = self.rotors.step(state.command, mask)
-        if not self.on_body:
-            return mean, end, None
+        if not self.air.acts:
+            return mean, end, self._push if self._is_pushed else None
         if self._gusts is not None:
             self._gusts.step(mask, self._noise.normal(mask))
         wind = self.wind
         if self._downwash is not None and state.position.shape[1] > 1:
             wind = add(wind, self._downwash.air(state))
-        return mean, end, self.air.step(state, mean, root, wind, mask)
+        wrench = self.air.step(state, mean, root, wind, mask)
+        return mean, end, wrench + self._push if self._is_pushed else wrench

@@ -169,8 +169,12 @@ class Sensor(Source):
         fresh = due
         if some(due):
             normal = self._noise.normal(due)
-            fresh = due & (normal[..., -1] >= self._lost)
-            self._held = chosen(fresh, self._read(normal), self._held)
+            parameters = self.world.parameters
+            frozen = parameters.get(f"{self.about.name}_frozen", 0.0)
+            lost = parameters.get(f"{self.about.name}_lost", 0.0)
+            fresh = due & (normal[..., -1] >= self._lost) & (frozen + lost == 0)
+            held = self._held * np.expand_dims(lost == 0, -1)
+            self._held = chosen(fresh, self._read(normal), held)
         readings = pushed(self._readings, _flagged(self._held, fresh))
         self._readings = chosen(mask, readings, self._readings)
 

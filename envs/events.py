@@ -1,0 +1,91 @@
+"""What happens to a drone in flight: a gust, a kick, a rotor that fails, a goal that moves.
+
+An event changes a few parameters for a while, of those that are drawn for an episode and of some
+more: `events.toml` says which. `stages/events.py` makes it happen.
+"""
+
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..models.errors import InputError, shortened
+from ..models.fields import Choice, Limits, Text, check, check_names, mapping
+from ..models.files import read_own_toml, read_toml
+from .spec import Values
+
+if TYPE_CHECKING:
+    from .config import EnvConfig
+
+MAX_EVENTS = 64
+KINDS = read_own_toml(__file__, "events")
+ALWAYS = KINDS.pop("all")
+"""Of all kinds."""
+
+
+def read_events(given: object) -> tuple[Values, ...]:
+    """Kind and given sizes of events, from tables or from a TOML file.
+
+    Raises `InputError`, or `OSError` for a file that cannot be read.
+    """
+    if isinstance(given, str):
+        given = read_toml(Path(given), "events").get("events")
+    if not isinstance(given, list | tuple) or len(given) > MAX_EVENTS:
+        raise InputError(f"events: expected at most {MAX_EVENTS} tables, got {shortened(given)}")
+    return tuple(_read(table, f"events[{number}]") for number, table in enumerate(given))
+
+
+def _read(table: object, where: str) -> Values:
+    given = mapping(table, where)
+    kind = check(f"{where}.kind", Choice(tuple(KINDS)), given.pop("kind", None))
+    event = {"kind": kind}
+    sizes = ALWAYS | KINDS[kind]
+    check_names(given, sizes, where)
+    if ("at" in given) == ("when" in given):
+        raise InputError(f"{where}: expected at or when, got both or none")
+    for name, row in sizes.items():
+        own = {key: x for key, x in row.items() if key not in ("default", "less", "changes")}
+        rule = Text(**own) if "pattern" in own else Limits(**own)
+        if name in given:
+            event[name] = check(f"{where}.{name}", rule, given[name])
+        elif "default" not in row:
+            raise InputError(f"{where}: expected {name} of a {kind}, got none")
+    return event
+
+
+def steps_of(event: Values, period: float) -> float:
+    """Control steps of `period` s that an event lasts; infinite where it has no end."""
+    usual = period if event["kind"] == "kick" else math.inf
+    return max(1.0, float(np.rint(event.get("duration", usual) / period)))
+
+
+def changes_of(events: Sequence[Values], period: float) -> dict[str, NDArray[np.float64]]:
+    """By how much each of E events changes parameters: by the names of these, (E,)."""
+    changes: dict[str, NDArray[np.float64]] = {}
+    for number, event in enumerate(events):
+        sizes = KINDS[event["kind"]]
+        values = {name: row.get("default") for name, row in sizes.items()} | event
+        time = steps_of(event, period) * period if event["kind"] == "kick" else 1.0
+        for name, row in sizes.items():
+            value = 1.0 if isinstance(values[name], str) else values[name]
+            sums = np.ravel(value) - row.get("less", 0.0)
+            for changed, change in zip(row.get("changes", ()), sums, strict=False):
+                of_all = changes.setdefault(changed.format(**values), np.zeros(len(events)))
+                of_all[number] = change / time
+    return changes
+
+
+def check_events(config: "EnvConfig") -> None:
+    """Refuse by name what an env has not. Raises `InputError`."""
+    for number, event in enumerate(config.events):
+        where = f"events[{number}]"
+        drones = Limits(0, config.drones - 1, whole=True)
+        check(f"{where}.drone", drones, event.get("drone", 0))
+        sensor = event.get("sensor")
+        if sensor and sensor not in config.sensors:
+            raise InputError(f"{where}: expected a sensor of the env, got {sensor}, which is off")
+        if event["kind"] == "goal" and "goal" not in config.task:
+            raise InputError(f"{where}: expected a task with the option goal, got {config.env_id}")

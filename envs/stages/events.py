@@ -1,0 +1,81 @@
+"""Events in flight: when they happen, and what they change meanwhile."""
+
+import numpy as np
+
+from ...models.fields import check_names
+from ...sim import Array, World, stack
+from ...sim.snapshots import Arrays
+from ...sim.state import total
+from ..events import changes_of, steps_of
+from ..tasks.task import Task
+from ..telemetry import quantities_of
+from .record import Record, Stage
+
+
+class Events(Stage):
+    """Notes after a step which of E events happen, and changes the parameters of later steps.
+
+    Attributes:
+        task, world, record: The telemetry is read from them.
+    """
+
+    arrays = ("fired",)
+    record: Record
+
+    def __init__(self, task: Task, world: World) -> None:
+        self.task = task
+        self.world = world
+        events = task.config.events
+        period = task.control_period
+        drones = np.arange(world.shape[1])
+        whose = [drones == event.get("drone", drones) for event in events]
+        self._whose = np.stack(whose, axis=-1)
+        first = np.array([event.get("at", 0.0) for event in events])
+        self._first = np.ceil(first / period - 1e-6)
+        self._steps = np.array([steps_of(event, period) for event in events])
+        self._changes = changes_of(events, period)
+        self._conditions = [event.get("when", "") for event in events]
+        self._quantities = {
+            name: (quantity, index)
+            for quantity in quantities_of(task)
+            for index, name in enumerate(quantity.components)
+        }
+        compared = [condition.split()[0] for condition in self._conditions if condition]
+        check_names(compared, self._quantities, "events: when")
+
+    def begin(self, record: Record) -> None:
+        """Nothing has happened."""
+        record.fired = np.full((*record.shape, len(self._first)), np.inf)
+
+    def act(self, record: Record) -> None:
+        """Change what the step that begins is flown with."""
+        self._change(record, record.steps)
+
+    def restore(self, record: Record, arrays: Arrays) -> None:
+        """Change what the last step was flown with."""
+        if record.has_begun:
+            self._change(record, record.steps - 1)
+
+    def step(self, record: Record) -> None:
+        """Note what happens now."""
+        self.record = record
+        steps = record.steps[..., None]
+        excess = stack([self._excess(condition) for condition in self._conditions])
+        happens = (excess > 0) & (steps >= self._first) & self._whose
+        record.fired = np.where(happens & (record.fired == np.inf), steps, record.fired)
+
+    def _change(self, record: Record, steps: Array) -> None:
+        age = steps[..., None] - record.fired
+        lasts = (age >= 0) & (age < self._steps)
+        changes = self._changes.items()
+        self.world.change({name: total(np.where(lasts, x, 0.0)) for name, x in changes})
+
+    def _excess(self, condition: str) -> Array:
+        """By how much a condition holds, (W, A); 1 without one."""
+        if not condition:
+            return 1.0
+        name, sign, number = condition.split()
+        quantity, index = self._quantities[name]
+        values = quantity.read(self)  # type: ignore[arg-type]  # it has what is read
+        excess = values[..., index] - float(number)
+        return excess if sign == ">" else -excess
