@@ -49,23 +49,15 @@ class Failsafe:
 
         Telemetry has `attitude`, `velocity`, `body_rates` and `thrust`, (N, ...).
         """
-        thrust = telemetry["thrust"]
         if self._measure == "off":
-            return -np.ones_like(thrust)
-        state = WorldState(
-            velocity=telemetry["velocity"],
-            body_rates=telemetry["body_rates"],
-            command=thrust,
-            thrust=thrust,
-            touching=None,
-        )
-        return self._climbing(-DESCENT * (self._measure == "land"), state, telemetry["attitude"])
+            return -np.ones_like(telemetry["thrust"])
+        return self._climbing(-DESCENT * (self._measure == "land"), state_of(telemetry))
 
-    def _climbing(self, speed: float, state: WorldState, quaternion: Array) -> Array:
+    def _climbing(self, speed: float, state: WorldState) -> Array:
         """Actions that ask for a vertical speed, m/s, and for none across."""
         controller = self._controller
         pilot = self._pilot
-        axes = axes_of(quaternion)
+        axes = axes_of(state.quaternion)
         collective, axis = pilot.aim((0.0, 0.0, speed), axes, state)
         rates = pilot.rates_to(axis, 0.0, axes)
         if isinstance(controller, RotorThrust):
@@ -83,3 +75,16 @@ class Failsafe:
             forward, left = turned((x, -y), axis[0], axis[1])
             asked[1:] = np.arcsin(-left), np.arctan2(forward, axis[2]), 0.0
         return clip(stack(asked) / controller.constants["action_scale"], -1.0, 1.0)
+
+
+def state_of(telemetry: Mapping[str, Array]) -> WorldState:
+    """What loops of control look at, from the telemetry, (N, ...)."""
+    thrust = telemetry["thrust"]
+    return WorldState(
+        quaternion=telemetry["attitude"],
+        velocity=telemetry["velocity"],
+        body_rates=telemetry["body_rates"],
+        command=thrust,
+        thrust=thrust,
+        touching=None,
+    )

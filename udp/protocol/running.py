@@ -105,12 +105,10 @@ class FreeRunning(OneAgent):
         self.unasked += 1
         self.counters["held"] += 1
         done = world.done
-        if done.all():
-            return
         actions = self._actions
         if self.failsafe is not None and self._held * self.period > self.run.silence:
             actions = self.failsafe().astype(actions.dtype)
-        orders = np.where(done, np.uint8(FREEZE), np.uint8(FLY))
+        orders = done * np.uint8(FREEZE)
         self.cause = Command(session=0, sequence=0, actions=actions, orders=orders)
         world.advance(actions, None, None, done)
         self._sum(True)
