@@ -48,6 +48,7 @@ STACKS: Final[Mapping[str, StackInfo]] = {
             1000.0,
             ("auto", "pid", "mellinger", "indi", "brescianini", "policy"),
         ),
+        StackInfo("px4", "Px4", 250.0, ("offboard",)),
     )
 }
 

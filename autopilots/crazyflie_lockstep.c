@@ -59,17 +59,26 @@ __attribute__((constructor)) static void begin(void)
     receive = dlsym(RTLD_NEXT, "recvfrom");
 }
 
+/* The first to send is the simulator. */
+static int is_simulator(const struct sockaddr_in *from)
+{
+    if (!simulator.sin_port)
+        simulator = *from;
+    return from->sin_port == simulator.sin_port && from->sin_addr.s_addr == simulator.sin_addr.s_addr;
+}
+
 /* Take datagrams from the socket until a reading of the IMU. */
 static void collect(void)
 {
     int is_imu = 0;
     while (!is_imu) {
         char datagram[SIZE];
-        socklen_t length = sizeof simulator;
-        ssize_t got = receive(link_socket, datagram, SIZE, 0, (struct sockaddr *)&simulator, &length);
+        struct sockaddr_in from;
+        socklen_t length = sizeof from;
+        ssize_t got = receive(link_socket, datagram, SIZE, 0, (struct sockaddr *)&from, &length);
         if (got < 0 && errno != EINTR)
             _exit(1);
-        if (got <= 0 || count == SLOTS)
+        if (got <= 0 || count == SLOTS || !is_simulator(&from))
             continue;
         unsigned slot = (first + count++) % SLOTS;
         memcpy(datagrams[slot], datagram, got);

@@ -94,6 +94,10 @@ class Program:
         """A socket that gets what the program sends there."""
         return self._closing.enter_context(bound_socket(self.name, port))
 
+    def keep(self, connection: socket.socket) -> socket.socket:
+        """A connection to the program, which is closed with it."""
+        return self._closing.enter_context(connection)
+
     def receive(self, where: socket.socket | None = None, wait: float = ANSWER) -> bytes:
         """The next datagram, of `link` unless told otherwise.
 

@@ -30,7 +30,7 @@ class Fly(EnvFlags, MavlinkFlags):
     env: str = "rotorgram/Waypoints-v0"
     """Task by its id, or module:Name-v0 for one that a module of the working directory registers.
     Its options are flags --env.NAME."""
-    autopilot: Positional[Literal["ardupilot", "betaflight", "crazyflie"]]
+    autopilot: Positional[Literal["ardupilot", "betaflight", "crazyflie", "px4"]]
     """Whose program it is."""
     program: Annotated[Path | None, arg(metavar="PATH")] = None
     """The program: its SITL, built by you or by others."""

@@ -1,1 +1,1 @@
-"""Bytes of flight stacks, one module for each: no socket, no clock, NumPy alone."""
+"""Bytes of flight stacks, one module for each: no socket and no clock."""

@@ -1,0 +1,181 @@
+"""PX4 in the seat: its program (SITL) in lock-step, flown by setpoints from outside (offboard)."""
+
+import socket
+from contextlib import suppress
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Final
+
+import numpy as np
+from pymavlink.dialects.v20 import common
+
+from ..agents.policies import Observation
+from ..models import InputError, Vehicle
+from ..sim.control.gains import LEAD, Gains
+from ..udp.protocol.errors import PeerClosed, PeerSilent
+from .programs import ANSWER, HOST, Program
+from .protocol import px4 as protocol
+from .reading import Floats, Order, Reading
+from .seat import Start
+
+BOOT: Final = 5.0
+"""Time until it gets orders, s of its clock: its estimate has to settle first."""
+CONNECT: Final = 30.0
+"""Longest time until it connects, s."""
+_ABOVE: Final = np.array((0.0, 0.0, 2.0))  # m: it lifts off for a goal above it alone
+GPS_EVERY: Final = 25
+"""Steps between two fixes."""
+ORDER_EVERY: Final = 10
+"""Steps between two setpoints: it wants more than two a second."""
+COMMAND_EVERY: Final = 250
+"""Steps between two requests to arm and to fly by setpoints."""
+LAG: Final = 0.03
+"""With which the rotors are taken to follow, s: its filters add to their own."""
+_MAIN_MOTOR: Final = 101  # function of an output: the first motor
+_MODEL: Final = "none_iris"
+_WE: Final = (245, common.MAV_COMP_ID_ONBOARD_COMPUTER)
+_BUILD: Final = Path("build/px4_sitl_default")
+_PARAMETERS: Final = {
+    "COM_RC_IN_MODE": 4.0,  # no sticks
+    "NAV_DLL_ACT": 0.0,  # no ground station
+    "COM_DISARM_PRFLT": -1.0,  # it may stand armed
+    "SDLOG_MODE": -1.0,
+}
+
+
+def parameters(vehicle: Vehicle) -> dict[str, float]:
+    """Its parameters for a vehicle: rotors, thrust and loops. Names are PX4's."""
+    found = dict(_PARAMETERS)
+    found["CA_ROTOR_COUNT"] = vehicle.num_rotors
+    for number, rotor in enumerate(vehicle.rotors):
+        x, y, _ = rotor.position
+        found[f"CA_ROTOR{number}_PX"] = x
+        found[f"CA_ROTOR{number}_PY"] = -y
+        found[f"CA_ROTOR{number}_KM"] = -rotor.reaction[2]
+        found[f"PWM_MAIN_FUNC{number + 1}"] = _MAIN_MOTOR + number
+    curve = vehicle.coefficients["rotors.curve"] or (0.0, 0.0, 1.0)
+    found["THR_MDL_FAC"] = curve[2]
+    hover = float(vehicle.hover_thrust.sum() / vehicle.thrust_high.sum())
+    found["MPC_THR_HOVER"] = hover
+    found["MPC_THR_MIN"] = hover / 4.0
+    lag = vehicle.coefficients["rotors.time_constant"] or 0.0
+    gains = Gains.of(vehicle, 1.0 / protocol.RATE, LEAD * max(lag, LAG))  # no lead of its own
+    for axis, name in enumerate(("ROLL", "PITCH", "YAW")):
+        levers = vehicle.allocation[1 + axis] * vehicle.thrust_high
+        # Its mixer moves each rotor by sqrt(1/2) on average for a torque of 1; for yaw by 1.
+        reach = np.sqrt(levers @ levers * np.count_nonzero(levers) / 2.0)
+        if name == "YAW":
+            reach = levers @ levers / abs(levers).max()
+        gain = gains.rate[axis] * vehicle.inertia[axis, axis] / reach
+        found[f"MC_{name}RATE_P"] = float(gain)
+        found[f"MC_{name}RATE_I"] = float(gain)
+        found[f"MC_{name}RATE_D"] = 0.0
+        found[f"MC_{name}_P"] = gains.heading if name == "YAW" else gains.attitude
+    for axes in ("XY", "Z"):
+        found[f"MPC_{axes}_P"] = gains.position
+        found[f"MPC_{axes}_VEL_P_ACC"] = gains.velocity
+    return found
+
+
+class Px4:
+    """A program of PX4's SITL, the model `none_iris` with the parameters of the vehicle.
+
+    It connects, and gets sensors 250 times a second of its clock. While it boots it gives no
+    outputs, and the next reading comes after a step of real time; from its first outputs on, each
+    step waits for those of its reading.
+    """
+
+    def __init__(self, start: Start) -> None:
+        _, vehicle, _, program, _ = start
+        self._rotors = vehicle.num_rotors
+        self._throttles = np.zeros(self._rotors)
+        self._time = 0  # of the latest outputs, µs; 0 before the first
+        self._steps = 0
+        self.ready = False
+        self.why = "it does not arm"
+        self.late = 0
+        self._program = Program("px4", protocol.OFFBOARD_PORT, (protocol.ORDERS_PORT,), apart=1)
+        number = self._program.number
+        port = protocol.PORT + number
+        root = program.parent.parent if program else _BUILD
+        words = ["-i", str(number), "-d", str(root / "etc")]
+        settings = parameters(vehicle).items()
+        environment = {f"PX4_PARAM_{name}": f"{value:.7g}" for name, value in settings}
+        with _listening(port) as server:
+            self._program.start(program, words, {"PX4_SIM_MODEL": _MODEL, **environment})
+            try:
+                self._peer = self._program.keep(server.accept()[0])
+            except TimeoutError:
+                raise PeerSilent(
+                    f"px4: expected it to connect to port {port}, got nothing"
+                ) from None
+        self._peer.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        self._hil = common.MAVLink(SimpleNamespace(write=self._peer.sendall), *_WE)
+        self._hil.robust_parsing = True
+        self._system = 1 + number
+        there = (HOST, protocol.ORDERS_PORT + number)
+        self._link = self._program.link
+        self._link.setblocking(False)
+        orders = SimpleNamespace(write=lambda datagram: self._link.sendto(datagram, there))
+        self._offboard = common.MAVLink(orders, *_WE)
+        self._offboard.robust_parsing = True
+
+    def step(self, reading: Reading, order: Order | None, observation: Observation) -> Floats:
+        """As `Stack.step`."""
+        self.ready = reading.time >= BOOT
+        if order is not None and self._steps % ORDER_EVERY == 0:
+            self._order(order)
+        try:
+            if self._steps % GPS_EVERY == 0:
+                self._hil.send(protocol.fix(reading))
+            self._hil.send(protocol.sensors(reading))
+            self._await(protocol.microseconds(reading))
+        except (BrokenPipeError, ConnectionResetError):
+            raise PeerClosed("px4: expected outputs, got the end of its connection") from None
+        self._steps += 1
+        return self._throttles
+
+    def _await(self, sent: int) -> None:
+        """Take outputs up to those of a reading of that time, µs."""
+        while self._time < sent:
+            wait = ANSWER if self._time else 1.0 / protocol.RATE
+            try:
+                received = self._program.receive(self._peer, wait)
+            except PeerSilent:
+                if self._time:
+                    raise
+                return
+            if not received:
+                raise ConnectionResetError
+            for message in self._hil.parse_buffer(received) or ():
+                if message.get_type() == "HIL_ACTUATOR_CONTROLS":
+                    self._throttles = protocol.throttles(message)[: self._rotors]
+                    self._time = message.time_usec
+
+    def _order(self, order: Order) -> None:
+        """Send where to fly, and now and then to do so; hear what it says about it."""
+        if order.stands:
+            order = order._replace(goal=order.goal + _ABOVE)
+        self._offboard.send(protocol.setpoint(order, self._system))
+        if self._steps % COMMAND_EVERY:
+            return
+        for request in protocol.requests(self._system):
+            self._offboard.send(request)
+        with suppress(BlockingIOError):
+            while True:
+                for message in self._offboard.parse_buffer(self._link.recv(2048)) or ():
+                    if message.get_type() == "STATUSTEXT":
+                        self.why = message.text
+
+    def close(self) -> None:
+        """As `Stack.close`."""
+        self._program.close()
+
+
+def _listening(port: int) -> socket.socket:
+    try:
+        server = socket.create_server((HOST, port))
+    except OSError:
+        raise InputError(f"px4: expected that port {port} is free, got one in use") from None
+    server.settimeout(CONNECT)
+    return server
