@@ -17,6 +17,7 @@ from ..models.errors import require
 from ..sim.control.gains import Gains
 from .programs import HOST, Program
 from .protocol import ardupilot as protocol
+from .protocol.frames import north_east_down
 from .reading import Floats, Order, Propellers, Reading
 from .seat import Start
 
@@ -132,8 +133,7 @@ class ArduPilot:
                 *_OPTIONS,
             ],
         )
-        self._frame = -1
-        self._receive()
+        self._frame = protocol.servos(self._program.meet(protocol.servos)).frame
 
     def step(self, reading: Reading, order: Order | None, observation: Observation) -> Floats:
         """As `Stack.step`."""
@@ -186,7 +186,7 @@ class ArduPilot:
         elif order is not None and self._commands:
             self._command(*self._commands[0])
         elif order is not None and not order.stands:
-            goal = protocol.north_east_down(order.goal - origin)
+            goal = north_east_down(order.goal - origin)
             yaw = math.pi / 2 - order.heading
             moves = [0.0] * 6
             fields = (0, 1, 1, 1, _POSITION_AND_YAW, *goal, *moves, yaw, 0)

@@ -78,14 +78,14 @@ def configuration(
         yield f"mmix {motor} 1.0 " + " ".join(f"{share:.4f}" for share in shares)
     lag = vehicle.coefficients["rotors.time_constant"] or REFERENCE_LAG
     slower = max(lag / REFERENCE_LAG, 1.0)
-    settings: dict[str, float] = {"angle_p_gain": 10.0 * gains.attitude}
+    settings = {"angle_p_gain": 10.0 * gains.attitude, "iterm_relax_cutoff": 15.0 / slower}
     torques = vehicle.allocation[1:] * propellers.slope * mix.T
     per_ps = torques.sum(axis=1) / vehicle.inertia.diagonal() * _PER_P
-    fast = min(_RATE_GAIN / slower, _FASTER * gains.rate[0])
+    fast = min(_RATE_GAIN / slower**0.7, _FASTER * gains.rate[0])
     rates = fast, fast, gains.rate[2]
     for name, rate, per_p, full in zip(_AXES, rates, per_ps, full_rates, strict=True):
         p = rate / per_p
-        settings |= {f"p_{name}": p, f"i_{name}": 1.8 * p / slower, f"f_{name}": 0.0}
+        settings |= {f"p_{name}": p, f"i_{name}": 1.8 * p / slower**2, f"f_{name}": 0.0}
         settings[f"{name}_rc_rate"] = full / 10.0
         if name != "yaw":
             settings |= dict.fromkeys((f"d_{name}", f"d_max_{name}"), 0.7 * p * slower)
@@ -114,11 +114,11 @@ class Running(Program):
             library = compiled(_SOURCE, self.folder)
             self._environment = {"LD_PRELOAD": str(library), "BETAFLIGHT_APART": str(self.apart)}
 
-    def fly(self, memory: bytes) -> None:
+    def fly(self, memory: bytes, motors: int) -> None:
         """Start it with a memory, and wait until it has booted."""
         (self.folder / _MEMORY).write_bytes(memory)
         self.start(self._path, environment={**self._environment, "BETAFLIGHT_LOCKSTEP": "1"})
-        self.receive()
+        self.meet(lambda datagram: protocol.throttles(datagram, motors))
 
     def tell(self, datagram: bytes, port: int) -> None:
         """Send to one of its ports, given as of the first program."""
@@ -203,7 +203,7 @@ class Betaflight:
         self.why = "it does not arm"
         self.late = 0
         self._program = Running(program, not real_time)
-        self._program.fly(memory)
+        self._program.fly(memory, self._rotors)
         self._due = time.monotonic() if real_time else math.nan
 
     def step(self, reading: Reading, order: Order | None, observation: Observation) -> Floats:

@@ -104,9 +104,7 @@ class Crazyflie:
         if not self._real_time:
             environment["LD_PRELOAD"] = str(compiled(_SOURCE, self._program.folder))
         self._program.start(program, [str(protocol.PORT + number), HOST], environment)
-        hello = self._program.receive()
-        if hello != protocol.HELLO:
-            raise InputError(f"crazyflie: expected its greeting, got {hello.hex()}")
+        self._program.meet(protocol.check_greeting)
         self._program.send(protocol.HELLO)
         self._due = self._heard = time.monotonic()
 

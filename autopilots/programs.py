@@ -5,8 +5,9 @@ import shlex
 import shutil
 import socket
 import subprocess
+import time
 import weakref
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack, suppress
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -43,7 +44,6 @@ class Program:
         self._end = weakref.finalize(self, self._closing.close)
         self.folder = Path(self._closing.enter_context(TemporaryDirectory(prefix="rotorgram-")))
         self._process: subprocess.Popen[bytes] | None = None
-        self._waits = False  # for a program that the user starts
         self._there: tuple[str, int] | None = None  # from where it sends
         for number in range(most if apart else 1):
             try:
@@ -70,7 +70,6 @@ class Program:
             around = [f"{name}={shlex.quote(value)}" for name, value in environment.items()]
             words = " ".join([*around, shlex.join([self.name, *arguments])])
             print(f"{self.name}: waiting for it; start it so:\ncd {self.folder} && {words}")
-            self._waits = True
             return
         command = [str(program), *arguments]
         if not os.access(program, os.X_OK):
@@ -104,20 +103,37 @@ class Program:
         Raises `PeerSilent` where none comes, `PeerClosed` if it has ended.
         """
         where = where or self.link
-        where.settimeout(None if self._waits else wait)
+        where.settimeout(wait)
         with suppress(TimeoutError, ConnectionRefusedError):
-            datagram, sender = where.recvfrom(2048)
-            if where is self.link and self._there is None:
+            while True:
+                datagram, sender = where.recvfrom(2048)
+                if where is not self.link or sender == self._there:
+                    return datagram
+        raise self._silent(wait)
+
+    def meet(self, read: Callable[[bytes], object]) -> bytes:
+        """The first datagram on `link` that can be read, as `InputError` is not raised. From then
+        on only its sender is heard. Raises as `receive`.
+        """
+        deadline = time.monotonic() + ANSWER
+        self.link.settimeout(ANSWER if self._process else None)
+        while self._process is None or time.monotonic() < deadline:
+            with suppress(TimeoutError, InputError):
+                datagram, sender = self.link.recvfrom(2048)
+                read(datagram)
                 self._there = sender
-                where.connect(sender)  # what others send is not heard from now on
-            self._waits = False
-            return datagram
+                self.link.connect(sender)
+                return datagram
+        raise self._silent(ANSWER)
+
+    def _silent(self, wait: float) -> Exception:
+        """Why nothing came."""
         status = self._process.poll() if self._process else None
         if status is None:
-            raise PeerSilent(f"{self.name}: expected an answer within {wait:g} s, got none")
+            return PeerSilent(f"{self.name}: expected an answer within {wait:g} s, got none")
         words = (self.folder / _LOG).read_text(errors="replace").strip().splitlines()
         said = words[-1] if words else "it said nothing"
-        raise PeerClosed(f"{self.name}: ended with status {status}: {said}")
+        return PeerClosed(f"{self.name}: ended with status {status}: {said}")
 
     def send(self, datagram: bytes, port: int | None = None) -> None:
         """Send to a port of it; unless told otherwise to that from which it sent first."""

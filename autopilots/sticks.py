@@ -6,6 +6,7 @@ the goal. The loops of the level turn its action into what a flight controller t
 
 import copy
 import math
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any, NamedTuple
 
@@ -28,7 +29,7 @@ from .reading import Floats, Reading
 PERIOD = 0.01
 """Time between two positions of the sticks without a policy, s."""
 LAG = 0.02
-"""Lag with which a flight controller is taken to follow them, s."""
+"""Least lag of rotors for which its loops are made, s: a flight controller makes up for half."""
 
 
 class Pilot(NamedTuple):
@@ -55,10 +56,11 @@ class StickPilot:
         level = "position"
         if pilot is None:
             spec = env_spec(config.changed(action=level, control_period=PERIOD))
-            lag = vehicle.coefficients["rotors.time_constant"] or 0.0
-            gains = Gains.of(vehicle, PERIOD, max(lag, LAG))
+            lag = max(vehicle.coefficients["rotors.time_constant"] or 0.0, LAG)
+            gains = Gains.of(vehicle, PERIOD + lag / 2)
             loops: Rates = Position(vehicle, gains, NO_EFFECTS)
-            self._policy: Policy = Geometric(spec)
+            constants = {**spec.constants, **loops.constants}
+            self._policy: Policy = Geometric(replace(spec, constants=constants))
         else:
             spec = pilot.spec
             level = str(spec.options["action"])

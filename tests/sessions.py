@@ -49,7 +49,7 @@ def hash_of(flight):
 def record(stack_name, program):
     """Fly, and write what was said. Returns the hash of the flight."""
     events = []
-    send, receive, start = Program.send, Program.receive, Program.start
+    send, receive, meet, start = Program.send, Program.receive, Program.meet, Program.start
 
     def sent(self, datagram, port=None):
         base = port - self.number * 10 if port else 0
@@ -61,11 +61,16 @@ def record(stack_name, program):
         events.append((None, datagram))
         return datagram
 
+    def met(self, read):
+        datagram = meet(self, read)
+        events.append((None, datagram))
+        return datagram
+
     def started(self, *arguments, **keywords):
         events.clear()  # what came before configured it
         start(self, *arguments, **keywords)
 
-    Program.send, Program.receive, Program.start = sent, received, started
+    Program.send, Program.receive, Program.meet, Program.start = sent, received, met, started
     flight, tally = flown(stack_name, program)
     assert not tally.faults, tally.faults
     SESSIONS.mkdir(exist_ok=True)

@@ -9,6 +9,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from ...models import InputError
 from ..reading import Order, Reading
 
 PORT: Final = 19950
@@ -32,6 +33,12 @@ _GOAL = struct.Struct("<BB4f")
 _MOTORS = struct.Struct("<4H")
 _MOTORS_HEADER = 0x90
 _KINDS = {"B": 0x08, "H": 0x09, "f": 0x06}
+
+
+def check_greeting(packet: bytes) -> None:
+    """Raise `InputError` for another packet."""
+    if packet != HELLO:
+        raise InputError(f"crazyflie: expected its greeting, got {packet.hex()}")
 
 
 def imu_packet(reading: Reading) -> bytes:

@@ -33,6 +33,10 @@ def free_port():
         return one.getsockname()[1]
 
 
+def any_of(datagram):
+    return datagram
+
+
 def started(text, name="echo"):
     program = Program(name, free_port())
     port = program.link.getsockname()[1]
@@ -50,7 +54,7 @@ def runs(pid):
 
 def test_it_runs_in_a_folder_of_its_own_that_goes():
     program = started(ECHO)
-    folder = program.receive().decode()
+    folder = program.meet(any_of).decode()
     assert folder == str(program.folder.resolve())
     program.close()
     assert not program.folder.exists()
@@ -73,7 +77,7 @@ def test_one_that_hangs_is_named():
 
 def test_one_that_ignores_the_signal_is_killed():
     program = started("import signal; signal.signal(signal.SIGTERM, signal.SIG_IGN)" + ECHO)
-    program.receive()
+    program.meet(any_of)
     began = time.monotonic()
     program.close()
     assert time.monotonic() - began < 10.0
@@ -148,7 +152,7 @@ def test_a_program_of_the_user_is_told_how_and_waited_for(capsys):
     with subprocess.Popen(
         ["sh", "-c", f"exec env {command.split('&& ')[1]}"], cwd=program.folder
     ) as own:
-        assert program.receive().decode() == str(program.folder.resolve())
+        assert program.meet(any_of).decode() == str(program.folder.resolve())
         own.kill()
     with pytest.raises(PeerSilent, match=r"expected an answer within 0\.1 s"):
         program.receive(wait=0.1)
@@ -156,11 +160,18 @@ def test_a_program_of_the_user_is_told_how_and_waited_for(capsys):
 
 
 def test_only_the_program_is_heard():
-    program = started(ECHO)
-    program.receive()
+    program = Program("echo", free_port())
     here = program.link.getsockname()
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
-        for number in range(1000):
+        other.sendto(b"hostile", here)
+        program.start(sys.executable, ["-c", ECHO, str(here[1])])
+
+        def read(datagram):
+            if datagram == b"hostile":
+                raise InputError("expected no hostile one")
+
+        program.meet(read)
+        for number in range(100):
             other.sendto(f"hostile {number}".encode(), here)
         program.send(b"hello")
         assert program.receive() == b"hello"
@@ -171,7 +182,7 @@ def test_only_the_program_is_heard():
 
 def test_one_that_is_killed_is_named():
     program = started(ECHO)
-    program.receive()
+    program.meet(any_of)
     program.send(b"end")
     for _ in range(3):
         time.sleep(0.05)
