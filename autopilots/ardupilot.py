@@ -35,8 +35,8 @@ _OPTIONS: Final = (
     "--serial1=none:0",
     "--serial2=none:0",
     "--defaults=vehicle.parm",
-    "--speedup=1000",
     "--home=47.377,8.542,0,0",
+    "--speedup=1000",
     "--start-time=1700000000",  # GPS tells it the time
 )
 _MODE, _ARM, _TAKE_OFF, _SEND_EVERY = 176, 400, 22, 511  # MAV_CMD
@@ -79,7 +79,7 @@ def tuning(vehicle: Vehicle, propellers: Propellers) -> dict[str, float]:
         "PSC_ACCZ_I": 2.0 * hover,
         "PSC_POSXY_P": gains.position,
         "PSC_VELXY_P": gains.velocity,
-        "PSC_VELXY_I": gains.velocity / 5.0,
+        "PSC_VELXY_I": gains.velocity / 2.0,
         "WPNAV_ACCEL": 100.0 * acceleration,  # cm/s²
     }
     angle_gains = (gains.attitude, gains.attitude, gains.heading)
@@ -105,10 +105,16 @@ class ArduPilot:
         self._mav = self._mavlink.MAVLink(None, srcSystem=255)
         self._mav.robust_parsing = True
         frame_class, frame_type, self._order = motor_order(vehicle)
-        frame = {"FRAME_CLASS": frame_class, "FRAME_TYPE": frame_type}
-        values = _TABLES["parameters"] | frame | tuning(vehicle, Propellers(config, vehicle))
+        values = _TABLES["parameters"] | tuning(vehicle, Propellers(config, vehicle))
+        values |= {"FRAME_CLASS": frame_class, "FRAME_TYPE": frame_type}
+        if "rangefinder" in config.sensors:
+            values["RNGFND1_TYPE"] = 100
         self._steps = 0
         self._origin: Floats | None = None
+        self._optional: dict[str, object] = {}
+        if any(config.effects.wind):
+            wind = np.array(config.effects.wind)
+            self._optional["velocity_wind"] = protocol.north_east_down(wind)
         self._commands = [
             (_MODE, 1, _GUIDED),
             (_ARM, 1, _FORCED),
@@ -144,7 +150,9 @@ class ArduPilot:
             if self._heard:
                 self._tell(order, self._origin)
         self._steps += 1
-        self._program.send(protocol.state_line(reading))
+        if "rangefinder" in observation:
+            self._optional["rng_1"] = observation["rangefinder"].item()
+        self._program.send(protocol.state_line(reading, self._optional))
         throttles = np.zeros(len(self._order))
         throttles[self._order] = self._receive()[: len(self._order)]
         return throttles

@@ -5,6 +5,7 @@ Body axes are x forward, y right, z down; the world is x north, y east, z down.
 
 import json
 import struct
+from collections.abc import Mapping
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -46,8 +47,11 @@ def servos(datagram: bytes) -> Servos:
     raise InputError(f"ardupilot: expected a datagram of servos, got {datagram[:16].hex()}")
 
 
-def state_line(reading: Reading) -> bytes:
-    """What its sensors and its estimate begin from."""
+def state_line(reading: Reading, optional: Mapping[str, object] = {}) -> bytes:
+    """A step of its simulator, with fields that the interface takes besides those it needs.
+
+    The program finds a field by its first letters: `velocity_wind` comes after `velocity`.
+    """
     state = {
         "timestamp": reading.time + FIRST,
         "imu": {
@@ -57,5 +61,6 @@ def state_line(reading: Reading) -> bytes:
         "position": north_east_down(reading.position),
         "attitude": angles_of(reading.quaternion),
         "velocity": north_east_down(reading.velocity),
+        **optional,
     }
     return f"\n{json.dumps(state)}\n".encode()
