@@ -36,6 +36,7 @@ MOST_MOTORS: Final = 8
 _LOWEST: Final = 1050.0  # µs: throttle 0
 _ARM, _ANGLE = 4, 5  # channels
 _AXES = ("roll", "pitch", "yaw")
+_BEHIND: Final = 0.005  # s: a longer delay is not made up for
 _MEMORY: Final = "eeprom.bin"
 _SOURCE: Final = Path(__file__).with_name("betaflight_lockstep.c")
 _CONFIG: Final = """\
@@ -204,7 +205,10 @@ class Betaflight:
         self.late = 0
         self._program = Running(program, not real_time)
         self._program.fly(memory, self._rotors)
-        self._due = time.monotonic() if real_time else math.nan
+        self._due = self._heard = math.nan
+        if real_time:
+            self._due = self._heard = time.monotonic()
+            self._program.link.setblocking(False)
 
     def step(self, reading: Reading, order: Order | None, observation: Observation) -> Floats:
         """As `Stack.step`."""
@@ -229,14 +233,20 @@ class Betaflight:
 
     def _newest(self) -> bytes | None:
         """What came last in a period of real time."""
-        self._due += 1.0 / protocol.RATE
+        self._due = max(self._due, time.monotonic() - _BEHIND) + 1.0 / protocol.RATE
         time.sleep(max(self._due - time.monotonic(), 0.0))
         newest = None
         while True:
             try:
-                newest = self._program.link.recv(2048, socket.MSG_DONTWAIT)
+                newest = self._program.link.recv(2048)
             except BlockingIOError:
-                return newest
+                break
+        now = time.monotonic()
+        if newest is not None:
+            self._heard = now
+        elif now - self._heard > ANSWER:
+            return self._program.receive(wait=0.1)
+        return newest
 
     def _move_sticks(self, reading: Reading, order: Order | None, observation: Observation) -> None:
         if reading.time < self._ordered:

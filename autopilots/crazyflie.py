@@ -145,7 +145,8 @@ class Crazyflie:
     def _receive(self) -> bytes:
         """Its next packet; an empty one where the step ends."""
         now = time.monotonic()
-        if not self._real_time or now - self._heard > ANSWER:
+        is_silent = self.ready and now - self._heard > ANSWER
+        if is_silent or not self._real_time:
             return self._program.receive()
         try:
             return self._program.receive(wait=max(self._due - now, _SHORTEST))

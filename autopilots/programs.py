@@ -45,17 +45,18 @@ class Program:
         self.folder = Path(self._closing.enter_context(TemporaryDirectory(prefix="rotorgram-")))
         self._process: subprocess.Popen[bytes] | None = None
         self._there: tuple[str, int] | None = None  # from where it sends
-        for number in range(most if apart else 1):
+        last = most - 1 if apart else 0
+        for self.number in range(last + 1):
+            moved = self.number * apart
             try:
-                self.link = self.listen(own + number * apart)
+                self.link = self.listen(own + moved)
                 for port in others:
-                    bound_socket(name, port + number * apart).close()
-            except InputError as error:
-                taken = error
+                    bound_socket(name, port + moved).close()
+            except InputError:
+                if self.number == last:
+                    raise
             else:
-                self.number = number
                 return
-        raise taken
 
     def start(
         self,
