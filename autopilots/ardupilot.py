@@ -114,7 +114,7 @@ class ArduPilot:
         self._optional: dict[str, object] = {}
         if any(config.effects.wind):
             wind = np.array(config.effects.wind)
-            self._optional["velocity_wind"] = protocol.north_east_down(wind)
+            self._optional["velocity_wind"] = north_east_down(wind)
         self._commands = [
             (_MODE, 1, _GUIDED),
             (_ARM, 1, _FORCED),

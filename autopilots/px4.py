@@ -15,7 +15,7 @@ from ..sim.control.gains import LEAD, Gains
 from ..udp.protocol.errors import PeerClosed, PeerSilent
 from .programs import ANSWER, HOST, Program
 from .protocol import px4 as protocol
-from .reading import Floats, Order, Reading
+from .reading import Floats, Order, Propellers, Reading
 from .seat import Start
 
 BOOT: Final = 5.0
@@ -32,7 +32,6 @@ COMMAND_EVERY: Final = 250
 LAG: Final = 0.03
 """With which the rotors are taken to follow, s: its filters add to their own."""
 _MAIN_MOTOR: Final = 101  # function of an output: the first motor
-_MODEL: Final = "none_iris"
 _WE: Final = (245, common.MAV_COMP_ID_ONBOARD_COMPUTER)
 _BUILD: Final = Path("build/px4_sitl_default")
 _PARAMETERS: Final = {
@@ -43,7 +42,7 @@ _PARAMETERS: Final = {
 }
 
 
-def parameters(vehicle: Vehicle) -> dict[str, float]:
+def parameters(vehicle: Vehicle, propellers: Propellers) -> dict[str, float]:
     """Its parameters for a vehicle: rotors, thrust and loops. Names are PX4's."""
     found = dict(_PARAMETERS)
     found["CA_ROTOR_COUNT"] = vehicle.num_rotors
@@ -53,9 +52,10 @@ def parameters(vehicle: Vehicle) -> dict[str, float]:
         found[f"CA_ROTOR{number}_PY"] = -y
         found[f"CA_ROTOR{number}_KM"] = -rotor.reaction[2]
         found[f"PWM_MAIN_FUNC{number + 1}"] = _MAIN_MOTOR + number
-    curve = vehicle.coefficients["rotors.curve"] or (0.0, 0.0, 1.0)
-    found["THR_MDL_FAC"] = curve[2]
     hover = float(vehicle.hover_thrust.sum() / vehicle.thrust_high.sum())
+    throttle = propellers.hover
+    # Its thrust at a throttle u is f u² + (1 - f) u; here f is right at hover.
+    found["THR_MDL_FAC"] = (hover - throttle) / (throttle**2 - throttle)
     found["MPC_THR_HOVER"] = hover
     found["MPC_THR_MIN"] = hover / 4.0
     lag = vehicle.coefficients["rotors.time_constant"] or 0.0
@@ -86,7 +86,7 @@ class Px4:
     """
 
     def __init__(self, start: Start) -> None:
-        _, vehicle, _, program, _ = start
+        config, vehicle, _, program, _ = start
         self._rotors = vehicle.num_rotors
         self._throttles = np.zeros(self._rotors)
         self._time = 0  # of the latest outputs, µs; 0 before the first
@@ -98,11 +98,13 @@ class Px4:
         number = self._program.number
         port = protocol.PORT + number
         root = program.parent.parent if program else _BUILD
-        words = ["-i", str(number), "-d", str(root / "etc")]
-        settings = parameters(vehicle).items()
+        arguments = ["-i", str(number), "-d", str(root / "etc")]
+        settings = parameters(vehicle, Propellers(config, vehicle)).items()
         environment = {f"PX4_PARAM_{name}": f"{value:.7g}" for name, value in settings}
+        environment["PX4_SIM_MODEL"] = "none_iris"
         with _listening(port) as server:
-            self._program.start(program, words, {"PX4_SIM_MODEL": _MODEL, **environment})
+            server.settimeout(CONNECT if program else None)
+            self._program.start(program, arguments, environment)
             try:
                 self._peer = self._program.keep(server.accept()[0])
             except TimeoutError:
@@ -174,8 +176,6 @@ class Px4:
 
 def _listening(port: int) -> socket.socket:
     try:
-        server = socket.create_server((HOST, port))
+        return socket.create_server((HOST, port))
     except OSError:
         raise InputError(f"px4: expected that port {port} is free, got one in use") from None
-    server.settimeout(CONNECT)
-    return server

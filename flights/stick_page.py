@@ -46,6 +46,10 @@ class _Handler(BaseHTTPRequestHandler):
     protocol_version = "HTTP/1.1"  # one connection for all requests of a page
     timeout = 5  # s without a request
 
+    def handle(self) -> None:
+        with suppress(OSError):  # the tab was closed
+            super().handle()
+
     def do_GET(self) -> None:
         self._reply(_PAGE.read_bytes, "text/html; charset=utf-8")
 
@@ -69,12 +73,11 @@ class _Handler(BaseHTTPRequestHandler):
             body = str(error).encode()
             kind = "text/plain; charset=utf-8"
             self.close_connection = True  # the rest of the body was not read
-        with suppress(OSError):  # the tab was closed
-            self.send_response(status)
-            self.send_header("Content-Type", kind)
-            self.send_header("Content-Length", str(len(body)))
-            self.end_headers()
-            self.wfile.write(body)
+        self.send_response(status)
+        self.send_header("Content-Type", kind)
+        self.send_header("Content-Length", str(len(body)))
+        self.end_headers()
+        self.wfile.write(body)
 
     def log_message(self, *_: object) -> None:
         """Say nothing."""

@@ -13,7 +13,7 @@ from ... import models
 from ...models.errors import InputError, shortened
 from ..effects import NO_EFFECTS, EffectOptions
 from ..state import Array, WorldState, clip, stack, total
-from .cascade import Attitude, Numbers, Position, Rates, Velocity
+from .cascade import Attitude, Numbers, Position, Rates, Velocity, share_of
 from .gains import Gains, shared_ranges
 
 _CASCADE: Final[dict[str, type[Rates]]] = {
@@ -117,8 +117,7 @@ class RotorThrust:
 
     def action(self, thrust: Array) -> Array:
         """Actions that ask for thrusts, N, shape (..., R)."""
-        over = thrust - self._hover
-        return over / np.where(over > 0.0, self._up, self._down)
+        return share_of(thrust - self._hover, self._up, self._down)
 
 
 class MixedController:

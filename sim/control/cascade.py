@@ -135,8 +135,7 @@ class Rates:
 
     def share(self, collective: Array) -> Array:
         """The number that asks for a collective thrust, N."""
-        over = collective - self._hover
-        return over / np.where(over > 0.0, self._up, self._down)
+        return share_of(collective - self._hover, self._up, self._down)
 
 
 class Attitude(Rates):
@@ -276,6 +275,11 @@ def _throttle(curve: Numbers) -> np.ndarray:
         low = np.where(is_below, middle, low)
         high = np.where(is_below, high, middle)
     return low
+
+
+def share_of(over: Array, up: Array, down: Array) -> Array:
+    """Actions that ask for thrusts over a hover's, whose ranges above and below it are given, N."""
+    return over / np.where(over > 0.0, up, down)
 
 
 def turned(nose: Parts, x: Array, y: Array) -> tuple[Array, Array]:

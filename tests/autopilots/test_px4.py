@@ -15,10 +15,11 @@ from rotorgram.models import InputError
 from rotorgram.udp.protocol.errors import PeerSilent
 
 pytest.importorskip("pymavlink", reason="pymavlink is not installed")
+from pymavlink.dialects.v20 import common
 from rotorgram.autopilots import find_stack, px4
 from rotorgram.autopilots.protocol import px4 as protocol
 from rotorgram.autopilots.px4 import parameters
-from rotorgram.autopilots.reading import Order, Reading
+from rotorgram.autopilots.reading import Order, Propellers, Reading
 from rotorgram.autopilots.seat import Seat, Start, seated
 
 PEER = Path(__file__).with_name("px4_peer.py")
@@ -82,9 +83,29 @@ def test_an_order_is_a_place_on_earth():
     assert message.type_mask == 8 + 16 + 32 + 64 + 128 + 256 + 2048
 
 
+def test_mutated_outputs_raise_nothing_but_a_sentence():
+    """Its parser drops what is broken; an intact message of wrong flags is refused by name."""
+    dice = np.random.default_rng(5)
+    here = common.MAVLink(None)
+    here.robust_parsing = True
+    there = common.MAVLink(None, 1, 1)
+    seen = 0
+    for number in range(20_000):
+        message = common.MAVLink_hil_actuator_controls_message(number, 16 * [0.5], 129, 1)
+        datagram = bytearray(message.pack(there))
+        for place in dice.integers(0, len(datagram), dice.integers(0, 3)):
+            datagram[place] = dice.integers(256)
+        for found in here.parse_buffer(bytes(datagram[: dice.integers(1, 200)])) or ():
+            if found.get_type() == "HIL_ACTUATOR_CONTROLS":
+                seen += 1
+                assert protocol.throttles(found).shape == (16,)
+    assert 1_000 < seen < 10_000
+
+
 def test_parameters_say_where_rotors_are_and_how_they_turn():
-    vehicle = EnvConfig.from_keywords("rotorgram/Hover-v0", vehicle="hummingbird").load_vehicle()
-    told = parameters(vehicle)
+    config = EnvConfig.from_keywords("rotorgram/Hover-v0", vehicle="crazyflie2")
+    vehicle = config.load_vehicle()
+    told = parameters(vehicle, Propellers(config, vehicle))
     assert told["CA_ROTOR_COUNT"] == 4
     for number, rotor in enumerate(vehicle.rotors):
         assert told[f"CA_ROTOR{number}_PX"] == rotor.position[0]
@@ -94,6 +115,8 @@ def test_parameters_say_where_rotors_are_and_how_they_turn():
         assert told[f"PWM_MAIN_FUNC{number + 1}"] == 101 + number
     hover = vehicle.mass * vehicle.gravity / vehicle.thrust_high.sum()
     assert told["MPC_THR_HOVER"] == pytest.approx(hover)
+    # The vehicle's file has the thrust 0.42517549 u + 0.57482451 u².
+    assert told["THR_MDL_FAC"] == pytest.approx(0.57482451, abs=1e-4)
 
 
 @pytest.fixture
@@ -122,6 +145,14 @@ def test_it_flies_waypoints_in_lock_step(program, vehicle):
     assert tally.faults == []
     assert tally.late == 0
     assert flight.headline[-1] == 0.0  # no points are left
+
+
+def test_a_flight_is_repeated_to_the_bit(program):
+    poses = []
+    for _ in range(2):
+        (flight,), _ = flown(program, "hummingbird", episode_length=100)
+        poses.append(flight.pose.tobytes())
+    assert poses[0] == poses[1]
 
 
 @pytest.mark.parametrize(
@@ -182,4 +213,3 @@ def test_several_fly_one_world(program):
     assert [one.ending for one in flights] == ["truncated", "truncated"]
     for one in flights:
         assert one.headline[-1] < 0.1
-        print(one.seconds, one.headline[-1])

@@ -57,12 +57,23 @@ def test_the_detector_learns_from_pictures(opengl: None, tmp_path: Path) -> None
     assert 0.0 < one["median error"] < 32
 
 
+def test_a_clone_flies_as_the_pilot_of_a_journal(tmp_path: Path) -> None:
+    flight = ("--env", "rotorgram/Hover-v0", "--episodes", "10", "--record", "flight.mcap")
+    run(rotorgram("evaluate", "geometric", *flight), tmp_path)
+    told = run_script("clone.py", tmp_path, "flight.mcap", "--epochs", "60")
+    assert told.startswith("10 flights, 2,500 steps: ")
+    pilot, clone = re.findall(r"last position_error (\S+), (\d+) crashed", told)
+    assert float(pilot[0]) < 0.01
+    assert 0.0 < float(clone[0]) < 0.5
+    assert clone[1] == "0"
+
+
 def test_every_script_is_run() -> None:
     scripts = {path.name for path in EXAMPLES.glob("*.py")}
     # test_own_task.py, test_capture.py, test_datasets.py, test_swarm_tasks.py, test_vfh.py,
     # test_raptor.py.
     others = {"landing.py", "capture.py", "dataset.py", "orca.py", "vfh.py", "raptor.py"}
-    others |= {"text_agent.py", "pad_detector.py"}
+    others |= {"text_agent.py", "pad_detector.py", "clone.py"}
     assert scripts == {*SHORT, *others}
     page = (EXAMPLES / "README.md").read_text()
     assert all(f"({script})" in page for script in scripts)

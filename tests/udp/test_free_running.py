@@ -3,6 +3,7 @@
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
@@ -14,8 +15,10 @@ from peers import ANY, Running, simulate
 from rotorgram.envs.compiled import make_loop
 from rotorgram.envs.config import EnvConfig
 from rotorgram.envs.failsafe import DESCENT, Failsafe
+from rotorgram.flights.recorded import recorded_trajectories
 from rotorgram.models import InputError
 from rotorgram.udp import RemoteEnv, Simulator
+from rotorgram.udp.journal.replay import Verification
 from rotorgram.udp.protocol.client import Client, LinkConfig
 from rotorgram.udp.protocol.messages import FLY, RESET, State
 from rotorgram.udp.protocol.party import AgentLink
@@ -56,7 +59,7 @@ class Flight:
     def __init__(self, failsafe: bool = True) -> None:
         self.now = 0.0
         self.world = World()
-        shape = layout(2, shapes=((1,),))
+        shape = layout(2, shapes=((),))
         client = Client(hello(worlds=2), shape, LinkConfig(timeout=60))
         link = AgentLink(("127.0.0.1", 1000), client, slice(0, 2))
         run = FreeRun(rate=RATE, silence=SILENCE)
@@ -123,7 +126,7 @@ def test_a_command_in_time_waits_for_the_clock_and_is_flown_once() -> None:
     assert same(flight.world.flown[1:], [[1.0, 2.0]])
     assert [s.time for s in flight.states] == pytest.approx([0.0, PERIOD])
     assert flight.states[1].rewards.tolist() == [1.0, 2.0]
-    assert flight.states[1].telemetry[0].tolist() == [[0.0], [0.0]]
+    assert flight.states[1].telemetry[0].tolist() == [0.0, 0.0]
     assert flight.counts == (0, 0, 0)
 
 
@@ -140,11 +143,11 @@ def test_a_silent_agent_leaves_the_last_action_and_then_the_failsafe() -> None:
     assert flight.counts == (4, 1, 0)
     last = flight.states[-1]
     assert last.rewards.tolist() == [1 + 1 + 9 + 9 + 5, 2 + 2 + 9 + 9 + 6]
-    assert last.telemetry[0].tolist() == pytest.approx(np.full((2, 1), 4 * PERIOD))
+    assert last.telemetry[0].tolist() == pytest.approx([4 * PERIOD] * 2)
     assert last.time == pytest.approx(6 * PERIOD)
     flight.say(5.0, 6.0)
     flight.wait(0.05)
-    assert flight.states[-1].telemetry[0].tolist() == [[0.0], [0.0]]
+    assert flight.states[-1].telemetry[0].tolist() == [0.0, 0.0]
     assert flight.states[-1].rewards.tolist() == [5.0, 6.0]
 
 
@@ -217,9 +220,11 @@ def test_every_level_hovers_and_lands_without_a_pilot(level: str) -> None:
 
 
 @contextmanager
-def flying(env: EnvConfig, **run: Any) -> Iterator[tuple[RemoteEnv, Running]]:
+def flying(
+    env: EnvConfig, record: Path | None = None, **run: Any
+) -> Iterator[tuple[RemoteEnv, Running]]:
     remote = RemoteEnv(ANY, connect=False, timeout=5, connect_timeout=5)
-    running = simulate(remote, env=env, free_run=FreeRun(**run))
+    running = simulate(remote, env=env, free_run=FreeRun(**run), record=record)
     try:
         remote.connect()
         yield remote, running
@@ -264,6 +269,19 @@ def test_a_silent_agent_over_udp(after: Any) -> None:
     counters = running.simulator.link.statistics.counters
     assert counters["late"] >= 1
     assert counters["held"] >= 75
+
+
+def test_its_journal_is_read_and_not_repeated(tmp_path: Path) -> None:
+    record = tmp_path / "flight.mcap"
+    env = config("rates")
+    with flying(env, record=record, rate=5.0) as (remote, _):
+        remote.reset(seed=1)
+        for _ in range(5):
+            remote.step(np.zeros(4, np.float32))
+    (flight,) = recorded_trajectories(record)
+    assert flight.telemetry["command_age"].shape == (len(flight) + 1,)
+    verdict = str(Verification(record, vehicle="crazyflie2"))
+    assert "expected a flight in lock-step, got one of sim --free-running" in verdict
 
 
 def test_what_cannot_keep_time_is_refused(capsys: Capsys) -> None:

@@ -14,6 +14,7 @@ from ...models import Backend
 from ...models.errors import InputError, printable, shortened
 from ..protocol.layout import Array
 from ..protocol.messages import Command, State
+from ..transport.simulator import COMMAND_AGE
 from ..transport.stepped import Steppable, make_stepped
 from .reader import Item, Recording, Session, count_of
 
@@ -108,6 +109,8 @@ class SessionVerdict:
         """The drones. Raises `InputError` unless their arrays are those of the recorded spec."""
         spec = self.session.spec
         task_type(spec.env_id)  # raises for one that is not known here: no file names a module
+        if COMMAND_AGE in spec.telemetry:
+            raise InputError("expected a flight in lock-step, got one of sim --free-running")
         keywords = {**self.flown, **spec.options}
         config = EnvConfig.from_keywords(spec.env_id, drones=len(spec.agents), **keywords)
         loop = make_stepped(config, self.session.num_envs, {})

@@ -119,7 +119,7 @@ class WorldRules:
         links: The agents.
         reason: Why the flight has ended; None before.
         cause: The Command that moved the world; the driver sets it to None when it has looked.
-        unasked: Steps of the world that no Command has asked for.
+        unasked: Steps of the session that no Command has asked for.
         more: Telemetry beside the world's, of all drones.
     """
 
@@ -266,6 +266,7 @@ class OneAgent(WorldRules):
         return False
 
     def _begin(self, seed: int) -> None:
+        self.unasked = 0
         seeds = first_seeds(seed, self.layout.drones)
         self._to_follow = reset_of_all(self.layout, seeds)
 

@@ -93,7 +93,7 @@ class FreeRunning(OneAgent):
         super().step(now)
         self._sum(~command.resets)
         self._sums = {}
-        self.more = (np.full((self.layout.drones, 1), self._held * self.period),)
+        self.more = (np.full(self.layout.drones, self._held * self.period),)
         self._held = 0
         self._actions = neutral(self.layout)
         self._actions[flies] = command.actions[flies]

@@ -41,11 +41,9 @@ DEFAULT_AGENT = ("127.0.0.1", 8001)
 DEFAULT_SIMULATOR = ("127.0.0.1", 8000)
 COMMAND_AGE = ArraySpec(
     name="command_age",
-    shape=(1,),
+    shape=(),
     dtype="float64",
-    low=0.0,
     unit="s",
-    components=("command_age",),
 )
 """In the telemetry of a simulator that keeps time: see `FreeRunning`."""
 _ALIVE_EVERY = 0.5  # period of the message Alive while an agent waits for a State, s
