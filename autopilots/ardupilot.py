@@ -29,17 +29,23 @@ TALK_EVERY: Final = 20
 """Steps between two messages to it."""
 ASK_EVERY: Final = 400
 """Steps between two requests for reports of its estimate, until they say that it is ready."""
+MOVED: Final = 0.05
+"""Least distance between the goals of two missions, m."""
 _TABLES: Final = tomllib.loads(Path(__file__).with_suffix(".toml").read_text())
 _NEAR: Final = 25.0  # °: between a rotor and the place of its motor
+_LATITUDE, _LONGITUDE = 47.377, 8.542
+_METRE: Final = 89.832  # of latitude, in 1e-7°
 _OPTIONS: Final = (
     "--serial1=none:0",
     "--serial2=none:0",
     "--defaults=vehicle.parm",
-    "--home=47.377,8.542,0,0",
+    f"--home={_LATITUDE},{_LONGITUDE},0,0",
     "--speedup=1000",
     "--start-time=1700000000",  # GPS tells it the time
 )
 _MODE, _ARM, _TAKE_OFF, _SEND_EVERY = 176, 400, 22, 511  # MAV_CMD
+_START_MISSION, _WAYPOINT = 300, 16
+_ABOVE_HOME: Final = 3
 _GUIDED, _FORCED = 4, 21196
 _REPORT: Final = 193  # EKF_STATUS_REPORT
 _READY: Final = 1 | 2 | 4 | 8 | 16  # attitude, velocities, position
@@ -100,7 +106,11 @@ class ArduPilot:
     """A program of ArduCopter's SITL. Its ports are free ones: many run side by side."""
 
     def __init__(self, start: Start) -> None:
-        config, vehicle, _, program, _ = start
+        config, vehicle, mode, program, real_time = start
+        if real_time:
+            raise InputError("real_time: expected lock-step with ardupilot, got real time")
+        self._auto = mode == "auto"
+        self._goal = np.full(3, np.inf)
         self._mavlink = require("pymavlink.dialects.v20.ardupilotmega", "autopilot", "ardupilot")
         self._mav = self._mavlink.MAVLink(None, srcSystem=255)
         self._mav.robust_parsing = True
@@ -182,10 +192,13 @@ class ArduPilot:
                     self.why = message.text
                 case "EKF_STATUS_REPORT":
                     self.ready = message.flags & _READY == _READY
-                case "COMMAND_ACK" if self._commands:
-                    waits_for, *_ = self._commands[0]
-                    if message.command == waits_for and message.result == 0:
+                case "COMMAND_ACK" if self._commands and message.result == 0:
+                    if message.command == self._commands[0][0]:
                         del self._commands[0]
+                case "MISSION_REQUEST":
+                    self._send_item(message.seq)
+                case "MISSION_ACK" if message.type == 0:
+                    self._commands = [(_START_MISSION,)]
 
     def _tell(self, order: Order | None, origin: Floats) -> None:
         """One message: a command until it is accepted, then the goal."""
@@ -193,12 +206,29 @@ class ArduPilot:
             self._command(_SEND_EVERY, _REPORT, 100_000)
         elif order is not None and self._commands:
             self._command(*self._commands[0])
-        elif order is not None and not order.stands:
+        elif order is None or order.stands:
+            return
+        elif self._auto:
+            if np.linalg.norm(order.goal - self._goal) > MOVED:
+                self._goal = order.goal
+                self._send("mission_count", 1, 1, 2)
+        else:
             goal = north_east_down(order.goal - origin)
             yaw = math.pi / 2 - order.heading
             moves = [0.0] * 6
             fields = (0, 1, 1, 1, _POSITION_AND_YAW, *goal, *moves, yaw, 0)
             self._send("set_position_target_local_ned", *fields)
+
+    def _send_item(self, number: int) -> None:
+        """Of a mission to the goal. Its first item, home, has no effect."""
+        assert self._origin is not None
+        east, north, up = self._goal.tolist()
+        latitude = round(_LATITUDE * 1e7 + north * _METRE)
+        east_metre = _METRE / math.cos(math.radians(_LATITUDE))
+        longitude = round(_LONGITUDE * 1e7 + east * east_metre)
+        place = (latitude, longitude, up - self._origin[2])
+        fields = (_ABOVE_HOME, _WAYPOINT, 0, 1, 1, 0, 0, 0, *place)
+        self._send("mission_item_int", 1, 1, number, *fields)
 
     def _command(self, number: int, *values: int) -> None:
         filled = (*values, *[0] * 7)[:7]

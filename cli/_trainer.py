@@ -180,8 +180,8 @@ def _note_lag(env: EnvConfig) -> None:
     lag = vehicle.coefficients["rotors.time_constant"]
     if lag and not env.effects.motor_lag:
         print(
-            f"note: the rotors of {vehicle.name} follow within {lag:g} s, those of this training "
-            "at once: --effects motor_lag trains for the craft itself"
+            f"note: the rotors of {vehicle.name} follow with a time constant of {lag:g} s, "
+            "those of this training at once: --effects motor_lag trains for the craft itself"
         )
 
 

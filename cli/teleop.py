@@ -22,15 +22,14 @@ class Teleop(EnvFlags):
     episodes: Count | None = None
     """End after so many episodes. Default: go on until Ctrl-C."""
     record: Path | None = None
-    """MCAP file to write every message to: the flights go over UDP then."""
+    """MCAP file to write every message to."""
 
     def run(self) -> None:
         """Serve the page, and fly episode after episode."""
-        from contextlib import ExitStack, closing
+        from contextlib import closing
         from itertools import count, islice
 
         from ..envs.specification import make_task
-        from ..envs.vector import LocalVectorEnv
         from ..flights.stick_page import StickPage
         from ..flights.sticks import HandPilot, fly_by_hand
         from ..models import InputError
@@ -44,13 +43,8 @@ class Teleop(EnvFlags):
         bind = resolve(parse_address(self.bind), insecure=self.insecure, way_out=way_out)
         config = self.env_config().resolve()
         pilot = HandPilot(make_task(config))
-        with ExitStack() as opened:
-            page = opened.enter_context(closing(StickPage(bind, pilot.steer)))
-            if self.record:
-                env = opened.enter_context(spawn_simulator(config, num_envs=1, record=self.record))
-            else:
-                local = LocalVectorEnv(config, 1, autoreset_mode="Disabled")
-                env = opened.enter_context(closing(local))
+        simulator = spawn_simulator(config, num_envs=1, record=self.record)
+        with closing(StickPage(bind, pilot.steer)) as page, simulator as env:
             pace = Pace(env.control_period, self.speed)
             print(f"open {page.url} (Ctrl-C ends)")
             for episode in islice(count(), self.episodes):

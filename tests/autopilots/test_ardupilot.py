@@ -59,6 +59,14 @@ TALKS = """\
             break
         for message in messages:
             with open(os.environ["SAID"], "a") as said:
+                if message.get_type() == "MISSION_COUNT":
+                    print("mission of", message.count, file=said)
+                    talk.send(mavlink.MAVLink_mission_request_message(255, 190, 1).pack(mav))
+                    continue
+                if message.get_type() == "MISSION_ITEM_INT":
+                    print("item", message.seq, message.x, message.y, message.z, file=said)
+                    talk.send(mavlink.MAVLink_mission_ack_message(255, 190, 0).pack(mav))
+                    continue
                 if message.get_type() != "COMMAND_LONG":
                     goal = (message.x, message.y, message.z, message.yaw)
                     print("goal", *[f"{number:.6f}" for number in goal], file=said)
@@ -77,9 +85,17 @@ TALKS = """\
 """
 
 
-def start_of(program: Path, vehicle: str = "paper") -> Start:
-    config = seated(EnvConfig.from_keywords("rotorgram/Hover-v0", vehicle=vehicle), RATE)
-    return Start(config, config.load_vehicle(), "guided", program)
+def start_of(program: Path, mode: str = "guided") -> Start:
+    config = seated(EnvConfig.from_keywords("rotorgram/Hover-v0", vehicle="paper"), RATE)
+    return Start(config, config.load_vehicle(), mode, program)
+
+
+def written(folder: Path, behaviour: str) -> Path:
+    """A program that does this for each state."""
+    program = folder / "peer"
+    program.write_text(PEER.format(python=sys.executable, behaviour=behaviour))
+    program.chmod(0o755)
+    return program
 
 
 def reading_at(time: float) -> Reading:
@@ -94,9 +110,7 @@ def reading_at(time: float) -> Reading:
 @pytest.fixture
 def peer(tmp_path: Path, request: pytest.FixtureRequest) -> Iterator[ArduPilot]:
     """A stack whose program does, for each state, what the test's parameter says."""
-    program = tmp_path / "peer"
-    program.write_text(PEER.format(python=sys.executable, behaviour=request.param))
-    program.chmod(0o755)
+    program = written(tmp_path, request.param)
     with closing(ArduPilot(start_of(program))) as stack:
         yield stack
 
@@ -198,27 +212,48 @@ def test_another_datagram_is_refused(peer: ArduPilot) -> None:
         peer.step(reading_at(0.0), None, {})
 
 
-def test_commands_one_after_the_other_then_the_goal(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Each is sent until it is accepted; the goal is relative to where the craft stood."""
+def told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, mode: str) -> tuple[list[str], set[str]]:
+    """Messages to a program in three seconds, of which the craft stands two and a half, and why."""
     said = tmp_path / "said.txt"
     monkeypatch.setenv("SAID", str(said))
-    program = tmp_path / "peer"
-    program.write_text(PEER.format(python=sys.executable, behaviour=TALKS))
-    program.chmod(0o755)
-    with closing(ArduPilot(start_of(program))) as stack:
-        whys = set()
+    program = written(tmp_path, TALKS)
+    whys = set()
+    with closing(ArduPilot(start_of(program, mode))) as stack:
         for step in range(1200):
             order = None
             if stack.ready:
                 order = Order(np.array((2.0, 4.0, 6.0)), 0.5, stands=step < 1000)
             stack.step(reading_at(step / RATE), order, {})
             whys.add(stack.why)
-    lines = said.read_text().split("\n")
+    return said.read_text().splitlines(), whys
+
+
+def test_commands_one_after_the_other_then_the_goal(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Each is sent until it is accepted; the goal is relative to where the craft stood."""
+    lines, whys = told(tmp_path, monkeypatch, "guided")
     assert lines[:5] == ["511", "176", "400", "400", "22"]
-    assert set(lines[5:]) == {f"goal 2.000000 1.000000 -3.000000 {math.pi / 2 - 0.5:.6f}", ""}
+    assert set(lines[5:]) == {f"goal 2.000000 1.000000 -3.000000 {math.pi / 2 - 0.5:.6f}"}
     assert "Arm: not yet" in whys
+
+
+def test_a_mission_to_the_goal(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """4 m north of 47.377° and 2 m east of 8.542°, 3 m above where it stood.
+
+    A degree of latitude has 111,319.5 m with the earth's radius of 6,378,137 m.
+    """
+    lines, _ = told(tmp_path, monkeypatch, "auto")
+    assert lines[:6] == ["511", "176", "400", "400", "22", "mission of 2"]
+    north = round(473_770_000 + 4.0 / 111_319.5 * 1e7)
+    east = round(85_420_000 + 2.0 / (111_319.5 * math.cos(math.radians(47.377))) * 1e7)
+    assert lines[6:] == [f"item 1 {north} {east} 3.0", "300"]
+
+
+def test_real_time_is_refused(tmp_path: Path) -> None:
+    start = start_of(tmp_path)._replace(real_time=True)
+    with pytest.raises(InputError, match="real_time: expected lock-step with ardupilot"):
+        ArduPilot(start)
 
 
 def test_without_its_program_the_motors_stop(
@@ -227,11 +262,7 @@ def test_without_its_program_the_motors_stop(
     """A program that asks for a throttle of 0.8 until it ends, half a second after it lifts."""
     monkeypatch.setenv("SAID", str(tmp_path / "said.txt"))
     lifts = "send(frame, *[1800] * 4)\n    if frame == 200: sys.exit('it is over')"
-    program = tmp_path / "peer"
-    behaviour = TALKS.replace("send(frame)", lifts)
-    program.write_text(PEER.format(python=sys.executable, behaviour=behaviour))
-    program.chmod(0o755)
-    start = start_of(program)
+    start = start_of(written(tmp_path, TALKS.replace("send(frame)", lifts)))
     with closing(LocalVectorEnv(start.config, 1, autoreset_mode="Disabled")) as env:
         seat = Seat(env.env_spec, start, ArduPilot)
         (flight,) = fly_episodes(env, seat, 1, "final")
@@ -242,11 +273,11 @@ def test_without_its_program_the_motors_stop(
 
 
 def fly(
-    env: str, vehicle: str, drones: int = 1, **keywords: object
+    env: str, vehicle: str, drones: int = 1, mode: str = "guided", **keywords: object
 ) -> tuple[list[Trajectory], Seat]:
     config = EnvConfig.from_keywords(env, vehicle=vehicle, drones=drones, **keywords)
     config = seated(config, RATE)
-    start = Start(config, config.load_vehicle(), "guided", Path(PROGRAM).absolute())
+    start = Start(config, config.load_vehicle(), mode, Path(PROGRAM).absolute())
     opened = LocalVectorEnv(config, config.drones, autoreset_mode="Disabled")
     with closing(opened) as env_:
         seat = Seat(env_.env_spec, start, ArduPilot)
@@ -274,6 +305,12 @@ def test_four_waypoints_twice_with_the_same_bits() -> None:
 def test_hovers_without_hand_tuning(vehicle: str) -> None:
     (flight,), _ = fly("rotorgram/Hover-v0", vehicle)
     assert distance(flight)[-400:].max() < 0.1
+
+
+@needs_program
+def test_flies_missions() -> None:
+    (flight,), _ = fly("rotorgram/Waypoints-v0", "heavy_hexa", mode="auto")
+    assert flight.telemetry["metrics"][-1, 0] == 0.0
 
 
 @needs_program

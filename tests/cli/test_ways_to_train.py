@@ -77,3 +77,24 @@ def test_a_training_goes_on_with_the_settings_of_its_backend(
     assert kept.position.env_steps == 400
     assert kept.env is not None
     assert kept.env.backend.dtype == "float64"
+
+
+@pytest.mark.parametrize(
+    ("words", "notes"),
+    [
+        (("--vehicle", "crazyflie2"), 1),
+        (("--vehicle", "crazyflie2", "--effects", "motor_lag"), 0),
+        ((), 0),  # the paper's file has no lag
+    ],
+    ids=["without", "with", "none"],
+)
+def test_a_training_without_the_lag_of_its_rotors_is_noted(
+    words: tuple[str, ...], notes: int, tmp_path: Path, capsys: Capsys
+) -> None:
+    task = ("ppo", "--env", "rotorgram/Hover-v0", *LEAST, "--out", tmp_path / "run")
+    out = trained(capsys, *task, *words)
+    note = (
+        "note: the rotors of Crazyflie 2.x follow with a time constant of 0.072 s, "
+        "those of this training at once: --effects motor_lag trains for the craft itself\n"
+    )
+    assert out.count(note) == out.count("note: ") == notes

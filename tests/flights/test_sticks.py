@@ -267,6 +267,7 @@ def test_a_flight_by_hand_is_recorded(tmp_path: Path) -> None:
             return True
 
     wait_until(steer, process)
+    connection.close()
     out, err = process.communicate(timeout=60)
     assert process.returncode == 0, err
     assert out.startswith("episode 0: 1.00 s, truncated, ")
