@@ -41,6 +41,9 @@ class Sim(WireFlags, MavlinkFlags):
     """With --free-running: seconds without a command, of simulated time, until --after."""
     after: Literal["hover", "land", "off", "hold"] = "hover"
     """What the craft does then: hover, land, stop its rotors, or hold the last action."""
+    allow_events: bool = False
+    """Let agents ask for the events of --events that happen when "asked": with a key, or on this
+    machine."""
     view: bool = False
     """Show the first world in a window. Lock-step does not wait for it. Keys: docs/viewing.md."""
 
@@ -80,6 +83,7 @@ class Sim(WireFlags, MavlinkFlags):
             insecure=self.insecure,
             record=self.record,
             free_run=self.free_run,
+            allow_events=self.allow_events,
         )
         links = simulator.rules.links
         there = f"{len(links)} agents" if several else f"the agent at {self.server}"

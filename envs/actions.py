@@ -1,5 +1,6 @@
 """What an agent sends, checked."""
 
+from collections.abc import Sequence
 from math import prod
 from typing import Self
 
@@ -7,7 +8,39 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..models.errors import InputError, shortened
-from .spec import ArraySpec, Discrete
+from .spec import ArraySpec, Discrete, EnvSpec
+
+
+def asked_bits(asks: Sequence[str]) -> int:
+    """The bits of the events that may be asked for."""
+    return sum(1 << bit for bit, kind in enumerate(asks) if kind)
+
+
+class Asking:
+    """Requests for events of an env, which its next step takes along."""
+
+    env_spec: EnvSpec
+    num_envs = 1
+    _asks: NDArray[np.uint64] | None = None
+
+    def ask(self, event: int, drones: NDArray[np.bool_] | None = None) -> None:
+        """Let an event happen in the next step, to all drones or to those of a mask, (N,).
+
+        `event` is its number in the option `events`, where it has the condition "asked". Raises
+        `InputError` for one that is not on offer.
+        """
+        offered = [number for number, kind in enumerate(self.env_spec.asks) if kind]
+        if event not in offered:
+            raise InputError(f"ask: expected an event on offer, one of {offered}, got {event!r}")
+        bits = np.zeros(self.num_envs, np.uint64) if self._asks is None else self._asks
+        bits[... if drones is None else drones] |= np.uint64(1 << event)
+        self._asks = bits
+
+    def _taken_asks(self) -> NDArray[np.uint64] | None:
+        """Requests since the last step, uint64, (N,), as of a Command."""
+        asks = self._asks
+        self._asks = None
+        return asks
 
 
 class Actions:

@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike
 
 from ..models.errors import InputError
 from ..sim.state import some
+from .actions import Asking
 from .info import Info, LazyInfo
 from .spaces import action_space, info_columns, observation_space
 from .spec import EnvSpec
@@ -32,7 +33,7 @@ Seed = int | Seeds | None
 """As of a reset: drone i gets seed + i, or the i-th of N seeds; None leaves their streams."""
 
 
-class AdvancingVectorEnv(VectorEnv[Observation, ArrayLike, Array]):
+class AdvancingVectorEnv(Asking, VectorEnv[Observation, ArrayLike, Array]):
     """A vector env that is stepped by `advance`, the step of the wire.
 
     `advance` sets the arrays below to new ones; those of earlier steps do not change.

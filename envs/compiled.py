@@ -64,7 +64,7 @@ class CompiledLoop(Loop):
             if flies and self._world.scenery.moves:
                 steps = machine.memory.get("record/kept/steps")
                 self._move_solids(steps + (1 if flew is None else flew))
-            results, told = machine.step(sent, flew, begun, record.active, seeds)
+            results, told = machine.step(sent, flew, begun, record.active, record.asked, seeds)
         except BaseException as error:
             self._settle()  # the physics has gone on
             if isinstance(error, PhysicsError):

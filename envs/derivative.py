@@ -117,7 +117,7 @@ def variables(program: Program, loop: Loop, fields: Fields) -> ByName:
 def _flown(loop: Loop, before: ByName) -> ByName:
     """State, rewards and flat observations after a step that all drones fly."""
     record = loop.record
-    record.flown = record.begun = None
+    record.flown = record.begun = record.asked = None
     record.sent = before["sent"]
     record.rest()
     record.run(None, loop.pipeline.fly)

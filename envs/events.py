@@ -20,7 +20,8 @@ from .spec import Values
 if TYPE_CHECKING:
     from .config import EnvConfig
 
-MAX_EVENTS = 64
+MAX_EVENTS = 64  # each is a bit of a request
+ASKED = "asked"  # condition of an event that happens at an agent's request
 KINDS = read_own_toml(__file__, "events")
 ALWAYS = KINDS.pop("all")
 """Of all kinds."""
@@ -47,8 +48,7 @@ def _read(table: object, where: str) -> Values:
     if ("at" in given) == ("when" in given):
         raise InputError(f"{where}: expected at or when, got both or none")
     for name, row in sizes.items():
-        own = {key: x for key, x in row.items() if key not in ("default", "less", "changes")}
-        rule = Text(**own) if "pattern" in own else Limits(**own)
+        rule = Text(**row["rule"]) if "pattern" in row["rule"] else Limits(**row["rule"])
         if name in given:
             event[name] = check(f"{where}.{name}", rule, given[name])
         elif "default" not in row:
@@ -76,6 +76,14 @@ def changes_of(events: Sequence[Values], period: float) -> dict[str, NDArray[np.
                 of_all = changes.setdefault(changed.format(**values), np.zeros(len(events)))
                 of_all[number] = change / time
     return changes
+
+
+def asks_of(events: Sequence[Values]) -> tuple[str, ...]:
+    """Of each event its kind where an agent may ask for it, otherwise an empty word; none if there
+    is no such event.
+    """
+    kinds = [event["kind"] if event.get("when") == ASKED else "" for event in events]
+    return tuple(kinds) if any(kinds) else ()
 
 
 def check_events(config: "EnvConfig") -> None:

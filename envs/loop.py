@@ -103,6 +103,7 @@ class Loop:
         resets: Array | None = None,
         seeds: Seed = None,
         frozen: Array | None = None,
+        asks: Array | None = None,
     ) -> None:
         """Reset some drones, freeze some, and fly the others for one control period.
 
@@ -116,7 +117,15 @@ class Loop:
         wanted = None if record.begun is None else checked_seeds(seeds, self.num_envs)
         if flies:
             record.sent = self.pipeline.actions.checked(actions, record.flown)
+            if self.spec.asks:
+                record.asked = self._asked(asks)
         self._step(wanted, flies=flies)
+
+    def _asked(self, asks: Array | None) -> Mask:
+        """Which events happen by request, (W, A, E)."""
+        bits = np.uint64(1) << np.arange(len(self.spec.asks), dtype=np.uint64)
+        numbers = np.zeros(self.num_envs, np.uint64) if asks is None else asks
+        return (numbers[:, None] & bits > 0).reshape(*self._record.shape, -1)
 
     def _step(self, seeds: Seeds | None, *, flies: bool) -> None:
         """Run the regions for the masks of the record."""

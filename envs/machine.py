@@ -79,6 +79,8 @@ class Machine:
         self._told = Layout(fields_of(self._telemetry()), lanes)
         given: Named = dict.fromkeys(_MASKS, (_BOOL, sent.shape[1:-1]))
         given["sent"] = (sent.dtype, sent.shape[1:])
+        if loop.record.asked is not None:
+            given["asked"] = (_BOOL, loop.record.asked.shape[1:])
         pushed = self._pushed()
         self._acts = tuple(pushed)
         given |= fields_of(world.scenery.shared()) | fields_of(pushed)
@@ -157,6 +159,7 @@ class Machine:
         flown: Mask | None,
         begun: Mask | None,
         active: Mask | None,
+        asked: Mask | None,
         seeds: Seeds | None = None,
     ) -> tuple[Array, Told]:
         """Run all regions. Returns what leaves the loop, by name, (N, ...), and `Loop.told`.
@@ -175,6 +178,8 @@ class Machine:
         self._all_fly = all_fly
         if sent is not None:
             given["sent"][:worlds] = sent
+            if asked is not None:
+                given["asked"][:worlds] = asked
         new: Any = np.empty(self._results.itemsize, np.uint8)
         # A third of the time of `ctypes.data`.
         self._address = ctypes.addressof(ctypes.c_char.from_buffer(new))
@@ -327,6 +332,7 @@ class Machine:
         record.flown = before["flown"]
         record.begun = before["begun"]
         record.sent = before["sent"]
+        record.asked = before.get("asked")
         record.run(before.get(mask), stages)
         return Region(mask, program, _stores(program, self._loop.state(), before))
 

@@ -8,6 +8,7 @@ from numpy.typing import ArrayLike
 
 from ..models.errors import InputError
 from ..sim.snapshots import Arrays, Snapshot
+from .actions import Asking
 from .autoreset import Observation
 from .compiled import make_loop
 from .config import EnvConfig
@@ -16,7 +17,7 @@ from .rendering import RENDER_MODES, Renderer
 from .spaces import action_space, joined, observation_space, telemetry_names
 
 
-class SingleEnv(gym.Env[Observation, ArrayLike]):
+class SingleEnv(Asking, gym.Env[Observation, ArrayLike]):
     """A drone that flies a task, in process.
 
     `info` has every component of the telemetry by its name (see `telemetry.py`) and the terms of
@@ -76,7 +77,7 @@ class SingleEnv(gym.Env[Observation, ArrayLike]):
     def step(self, action: ArrayLike) -> tuple[Observation, float, bool, bool, Info]:
         """Fly for one control period. See the task for shapes, units and ends."""
         loop = self._loop
-        loop.advance(action)
+        loop.advance(action, asks=self._taken_asks())
         if self.render_mode == "human":
             self.render()
         flags = loop.terminated.item(), loop.truncated.item()

@@ -235,7 +235,7 @@ class Mark(marks.Mark, _Part):
 class EnvSpec(_Part):
     """Everything that an agent must know of an env. Arrays are those of one drone."""
 
-    _optional = ("config_digest", "constants", "marks")
+    _optional = ("config_digest", "constants", "marks", "asks")
 
     env_id: Word
     options: Mapping[str, Any] = field(default_factory=dict)
@@ -262,6 +262,8 @@ class EnvSpec(_Part):
     names and units."""
     marks: tuple[Mark, ...] = ()
     """What pictures show of the task."""
+    asks: Words = ()
+    """For each of the option `events` its kind, where a Command may ask for it; else empty."""
 
     def __post_init__(self) -> None:
         check_fields(self, "", SpecError)
@@ -272,6 +274,7 @@ class EnvSpec(_Part):
         hidden = [array.privileged for array in self.observation]
         expected = "at least one array for the actor, and privileged ones last"
         _expect(not all(hidden) and hidden == sorted(hidden), "observation", expected, hidden)
+        _expect(len(self.asks) <= MAX_ARRAYS, "asks", f"at most {MAX_ARRAYS}", len(self.asks))
         _expect(len(self.marks) <= MAX_MARKS, "marks", f"at most {MAX_MARKS}", len(self.marks))
         for what, most in (("observation", MAX_ELEMENTS), ("telemetry", MAX_TOLD)):
             arrays = getattr(self, what)

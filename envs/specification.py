@@ -9,6 +9,7 @@ from ..sim.sensors.instruments import Instrument
 from ..sim.sensors.range_sensors import RangeSensor
 from . import registry
 from .config import EnvConfig
+from .events import asks_of
 from .pictures import Pictures, arrays_of, objects_of_all
 from .spec import ArraySpec, Discrete, EnvSpec
 from .stages.history import with_history
@@ -78,6 +79,7 @@ def spec_of(config: EnvConfig, task: Task) -> EnvSpec:
             **getattr(task.controller, "constants", {}),
         },
         marks=task.marks,
+        asks=asks_of(config.events),
     )
 
 

@@ -109,7 +109,7 @@ class LocalVectorEnv(AdvancingVectorEnv, VectorEnv[Observation, ArrayLike, Array
     ) -> None:
         """See the base."""
         loop = self.loop
-        loop.advance(actions, resets, seeds, frozen)
+        loop.advance(actions, resets, seeds, frozen, self._taken_asks())
         self._take_results()
         if self.render_mode == "human":
             self.render()

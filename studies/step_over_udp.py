@@ -44,7 +44,7 @@ def udp_echo(stack: ExitStack) -> Step:
     blocking sockets, on one core, where a wake-up costs least.
     """
     layout = layout_of(env_spec(EnvConfig(env_id=ENV_ID)))
-    words = [sys.executable, "-c", ECHO, str(layout.command.size)]
+    words = [sys.executable, "-c", ECHO, str(layout.commands[False, False].size)]
     process = stack.enter_context(subprocess.Popen(words, stdout=subprocess.PIPE))
     assert process.stdout is not None
     address = ("127.0.0.1", int(process.stdout.readline()))

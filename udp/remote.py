@@ -9,7 +9,7 @@ import numpy as np
 from gymnasium.vector import AutoresetMode, VectorEnv
 from numpy.typing import ArrayLike
 
-from ..envs.actions import Actions
+from ..envs.actions import Actions, Asking
 from ..envs.autoreset import (
     LOST,
     AdvancingVectorEnv,
@@ -38,7 +38,7 @@ _FLY = np.array([FLY], np.uint8)
 _RESET = np.array([RESET], np.uint8)
 
 
-class _Remote(NotCopied):
+class _Remote(Asking, NotCopied):
     """Base of both envs: the `Agent` behind them, and actions as they cross the wire."""
 
     _agent: Agent
@@ -153,7 +153,7 @@ class RemoteEnv(_Remote, gym.Env[Observation, ArrayLike]):
         self.connect()
         seeds = None if seed is None else np.array([seed], np.uint64)
         while True:
-            self._agent.exchange({0: (self._nothing, _RESET, seeds)})
+            self._agent.exchange({0: (self._nothing, _RESET, seeds, None)})
             if not self._agent.lost[0]:
                 break  # else one has come instead that was not reset
         self._flying = True
@@ -170,7 +170,7 @@ class RemoteEnv(_Remote, gym.Env[Observation, ArrayLike]):
             actions = self._actions.checked(action)
         self._flying = False  # until the answer is there
         try:
-            self._agent.exchange({0: (actions, _FLY, None)})
+            self._agent.exchange({0: (actions, _FLY, None, self._taken_asks())})
         except InputError:  # an action that is wrong, and nothing has happened
             self._flying = True
             raise
@@ -362,12 +362,18 @@ class RemoteVectorEnv(_Remote, AdvancingVectorEnv, VectorEnv[Observation, ArrayL
         asleep: Array = np.all(self._by_slot(frozen), axis=1)
         pending = np.flatnonzero(~asleep).tolist()
         reasons = [""] * self.num_simulators
+        asks = self._taken_asks()
         self._flying = False  # until the answers are there
         while pending:
             orders = self._by_slot((RESET * resets + FREEZE * frozen).astype(np.uint8))
             rows = self._by_slot(actions)
-            numbers = [None] * len(reasons) if seeds is None else self._by_slot(seeds)
-            self._agent.exchange({i: (rows[i], orders[i], numbers[i]) for i in pending})
+            optional = [
+                [None] * len(reasons) if numbers is None else self._by_slot(numbers)
+                for numbers in (seeds, asks)
+            ]
+            parts = list(zip(rows, orders, *optional, strict=True))
+            self._agent.exchange({slot: parts[slot] for slot in pending})
+            asks = None
             lost = self._agent.lost
             reasons = [new or old for new, old in zip(lost, reasons, strict=True)]
             if seeds is None:

@@ -1,12 +1,14 @@
 """Events in flight: when they happen, and what they change meanwhile."""
 
+from collections.abc import Callable
+
 import numpy as np
 
 from ...models.fields import check_names
 from ...sim import Array, World, stack
 from ...sim.snapshots import Arrays
 from ...sim.state import total
-from ..events import changes_of, steps_of
+from ..events import ASKED, changes_of, steps_of
 from ..tasks.task import Task
 from ..telemetry import quantities_of
 from .record import Record, Stage
@@ -34,21 +36,22 @@ class Events(Stage):
         self._first = np.ceil(first / period - 1e-6)
         self._steps = np.array([steps_of(event, period) for event in events])
         self._changes = changes_of(events, period)
-        self._conditions = [event.get("when", "") for event in events]
         self._quantities = {
             name: (quantity, index)
             for quantity in quantities_of(task)
             for index, name in enumerate(quantity.components)
         }
-        compared = [condition.split()[0] for condition in self._conditions if condition]
-        check_names(compared, self._quantities, "events: when")
+        self._conditions = [self._condition(event.get("when")) for event in events]
 
     def begin(self, record: Record) -> None:
         """Nothing has happened."""
         record.fired = np.full((*record.shape, len(self._first)), np.inf)
 
     def act(self, record: Record) -> None:
-        """Change what the step that begins is flown with."""
+        """Change what the step that begins is flown with. What is asked for happens at once."""
+        if record.asked is not None:
+            steps = record.steps[..., None]
+            record.fired = np.where(record.asked & self._whose, steps, record.fired)
         self._change(record, record.steps)
 
     def restore(self, record: Record, arrays: Arrays) -> None:
@@ -60,7 +63,7 @@ class Events(Stage):
         """Note what happens now."""
         self.record = record
         steps = record.steps[..., None]
-        excess = stack([self._excess(condition) for condition in self._conditions])
+        excess = stack([excess() for excess in self._conditions])
         happens = (excess > 0) & (steps >= self._first) & self._whose
         record.fired = np.where(happens & (record.fired == np.inf), steps, record.fired)
 
@@ -70,12 +73,13 @@ class Events(Stage):
         changes = self._changes.items()
         self.world.change({name: total(np.where(lasts, x, 0.0)) for name, x in changes})
 
-    def _excess(self, condition: str) -> Array:
-        """By how much a condition holds, (W, A); 1 without one."""
-        if not condition:
-            return 1.0
-        name, sign, number = condition.split()
+    def _condition(self, words: str | None) -> Callable[[], Array]:
+        """Gives by how much a condition holds, (W, A). Raises `InputError` for an unknown name."""
+        if words in (None, ASKED):
+            return lambda: float(words is None)
+        name, sign, number = words.split()
+        check_names([name], self._quantities, "events: when")
         quantity, index = self._quantities[name]
-        values = quantity.read(self)  # type: ignore[arg-type]  # it has what is read
-        excess = values[..., index] - float(number)
-        return excess if sign == ">" else -excess
+        scale = 1.0 if sign == ">" else -1.0
+        # A quantity reads no more of a loop than this has.
+        return lambda: scale * (quantity.read(self)[..., index] - float(number))  # type: ignore[arg-type]

@@ -31,6 +31,7 @@ class Record:
         flown: Drones that fly in this step; None: all.
         begun: Drones that begin an episode in this step; None: none.
         sent: Actions of the agent, float32, (W, A, k).
+        asked: Which events the agent asks for, (W, A, E); None: it may ask for none.
         action: The last action that was flown, (W, A, k).
         received: The action that arrives at the controller.
         thrust: Of each rotor, N, (W, A, R).
@@ -88,6 +89,7 @@ class Record:
         self.episodes = self.steps
         self.out = self.done = self.terminated = self.truncated = self.unfit = nobody
         self.waiting = ~nobody
+        self.asked: Mask | None = None
         self.reward = np.zeros(shape)
         self._nothing = self.reward
         self._nobody = nobody

@@ -67,7 +67,7 @@ namespace Rotorgram
     /// the strings of Hello, Refuse and Close.</summary>
     public sealed class Datagram
     {
-        public const int HeaderSize = 24, LongestText = 512, LongestDatagram = 65483, Version = 2;
+        public const int HeaderSize = 24, LongestText = 512, LongestDatagram = 65483, Version = 3;
 
         public readonly byte[] Bytes = new byte[65536];
         public int Length;
@@ -221,6 +221,7 @@ namespace Rotorgram
             ulong count = Take(4);
             c.HasSeeds = count > 0;
             if (c.HasSeeds && count != (ulong)drones) return false;
+            if (Take(4) != 0) return false; // requests: this simulator offers no events
             if (Length != (c.HasSeeds ? seeds + 8 * drones : orders + drones)) return false;
             at = 32;
             for (int i = 0; i < actions; i++)

@@ -82,9 +82,9 @@ def test_any_state_and_command_comes_back(of: Layout, seed: int) -> None:
         actions %= of.choices
     orders = dice.integers(0, 3, n).astype(np.uint8)
     order = Command(session=3, sequence=9, actions=actions, orders=orders)
-    assert_comes_back(order, of, of.command.size)
+    assert_comes_back(order, of, of.commands[False, False].size)
     order.seeds = dice.integers(0, 2**64, n, np.uint64)
-    assert_comes_back(order, of, of.seeded_command.size)
+    assert_comes_back(order, of, of.commands[True, False].size)
 
 
 def assert_comes_back(message: State | Command, of: Layout, size: int) -> None:
@@ -217,12 +217,12 @@ def test_a_discrete_action_is_checked_for_every_drone() -> None:  # fault 13
 
 def test_versions() -> None:
     data = binary.encode(hello())
-    newer = changed(data, 2, b"\3")
-    with pytest.raises(VersionMismatch, match="expected 2, got 3"):
+    newer = changed(data, 2, b"\4")
+    with pytest.raises(VersionMismatch, match="expected 3, got 4"):
         binary.decode(newer)
     refuse = Refuse(session=1, reason="x")
     data = binary.encode(refuse)
-    newer = changed(data, 2, b"\3")
+    newer = changed(data, 2, b"\4")
     assert binary.decode(newer) == refuse
 
 

@@ -155,7 +155,7 @@ def test_steps_a_second_where_datagrams_are_lost(
     assert pair.steps == [float(i + 1) for i in range(200)]
     assert pair.seen[:200] == [float(i) for i in range(200)]
     assert 200 / pair.now >= least
-    fragments = -(-of.state.size // 1168) + -(-of.command.size // 1168)
+    fragments = -(-of.state.size // 1168) + -(-of.commands[False, False].size // 1168)
     assert pair.sent / 200 <= fragments * (1 + 4 * loss) + 3
 
 

@@ -24,9 +24,9 @@ MESSAGES = {case["name"]: case for case in GOLDEN["messages"]}
 BODIES = json.loads((DATA / "golden_bodies.json").read_text("utf-8"))
 HELLOS = {
     # env, newest version, worlds, extensions
-    "hello": ("one", 2, 1, b""),
-    "hello of two worlds, with an extension": ("two", 3, 2, b"\x07\0\x03\0abc"),
-    "hello of two worlds of three drones": ("swarm", 2, 2, b""),
+    "hello": ("one", 3, 1, b""),
+    "hello of two worlds, with an extension": ("two", 4, 2, b"\x07\0\x03\0abc"),
+    "hello of two worlds of three drones": ("swarm", 3, 2, b""),
 }
 WRONG_CHECKSUMS = {"nothing", "a header cut short", "a wrong checksum"}
 
@@ -36,7 +36,7 @@ def bytes_of(name: str) -> bytes:
 
 
 def by_hand(kind: int, sequence: int, body: bytes) -> bytes:
-    head = bytes([0xA7, 0x52, 2, kind])
+    head = bytes([0xA7, 0x52, 3, kind])
     rest = struct.pack("<QQ", 0x0123456789ABCDEF, sequence)
     checksum = struct.pack("<I", zlib.crc32(head + rest + body))
     return head + checksum + rest + body
@@ -53,7 +53,7 @@ def test_the_bytes_are_those_of_the_page(case: dict[str, Any]) -> None:
 def test_the_bytes_of_hello_are_those_of_the_page(name: str) -> None:
     env, newest, worlds, extensions = HELLOS[name]
     spec = json.dumps(GOLDEN["envs"][env]["spec"], separators=(",", ":")).encode()
-    body = struct.pack("<BBHIII", 2, newest, 0, worlds, len(spec), 0)
+    body = struct.pack("<BBHIII", 3, newest, 0, worlds, len(spec), 0)
     assert bytes_of(name) == by_hand(1, 0, body + spec + extensions)
 
 
@@ -95,7 +95,7 @@ def test_specs_come_back() -> None:
         layout = LAYOUTS[name]
         assert json.loads(spec.to_json()) == case["spec"]
         assert layout.state.size == case["state bytes"]
-        sizes = [layout.command.size, layout.seeded_command.size]
+        sizes = [layout.commands[seeded, False].size for seeded in (False, True)]
         assert sizes == case["command bytes without and with seeds"]
 
 

@@ -507,7 +507,7 @@ def test_refusals_and_their_size() -> None:
 def test_versions_and_critical_extensions() -> None:  # fault 18
     critical = (Extension(number=9, value=b"", critical=True),)
     for message, words in (
-        (hello(spec=LONG, versions=(1, 1)), "versions 1 to 1, the agent 2"),
+        (hello(spec=LONG, versions=(1, 1)), "versions 1 to 1, the agent 3"),
         (hello(spec=LONG, extensions=critical), "no critical extension, got type 9"),
     ):
         server = agent()
@@ -522,7 +522,7 @@ def test_versions_and_critical_extensions() -> None:  # fault 18
     assert isinstance(plain(reply), Welcome)
     link = to(simulator(), "hello", Wire("agent", False))
     for wrong in (
-        Welcome(session=SESSION, nonce=1, version=3),
+        Welcome(session=SESSION, nonce=1, version=4),
         Welcome(session=SESSION, nonce=1, extensions=critical),
     ):
         assert link.receive(binary.encode(wrong), 0.0) is None

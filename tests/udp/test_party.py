@@ -37,7 +37,7 @@ class World:
     def observations(self) -> dict[str, Any]:
         return {"height": self.height}
 
-    def advance(self, actions: Any, resets: Any, seeds: Any, frozen: Any) -> None:
+    def advance(self, actions: Any, resets: Any, seeds: Any, frozen: Any, asks: Any = None) -> None:
         if resets is not None:
             assert resets.all()
             self.seeds.append(None if seeds is None else seeds.tolist())

@@ -162,7 +162,7 @@ GOLDEN = json.loads((ROOT / "docs" / "golden.json").read_text("utf-8"))
 JUNK_LINES = [
     *[line.encode() for line in GOLDEN["text of env one"]["malformed states"]],
     b"\xff\x00\xa7",
-    bytes.fromhex("a7520201"),
+    bytes.fromhex("a7520301"),
     b"42,close\x00",
     b"42,1,0,0,1,0,0",  # no telemetry
     b"42,1,0,0,1,0,0" + TELEMETRY.encode() + b",1",
@@ -373,14 +373,14 @@ def test_simulator_is_held_by_our_pid(
 NONCE = 0xFEDCBA9876543210
 
 
-def datagram(kind: int, session: int, sequence: int, body: bytes = b"", version: int = 2) -> bytes:
+def datagram(kind: int, session: int, sequence: int, body: bytes = b"", version: int = 3) -> bytes:
     head = bytes([0xA7, 0x52, version, kind])
     rest = struct.pack("<QQ", session, sequence) + body
     return head + struct.pack("<I", zlib.crc32(head + rest)) + rest
 
 
 def welcome(session: int, seed: int | None = None) -> bytes:
-    return datagram(2, session, 0, struct.pack("<QQBB6x", NONCE, seed or 0, seed is not None, 2))
+    return datagram(2, session, 0, struct.pack("<QQBB6x", NONCE, seed or 0, seed is not None, 3))
 
 
 def command(
@@ -430,13 +430,13 @@ class Hand:
 
     def hello(self) -> None:
         got = self.next()
-        assert got[:4] == b"\xa7\x52\x02\x01"
+        assert got[:4] == b"\xa7\x52\x03\x01"
         session, sequence = struct.unpack_from("<QQ", got, 8)
         assert (session not in (0, self.session), sequence) == (True, 0)
         self.session = session
         low, high, worlds, size = struct.unpack_from("<BB2xII", got, 24)
-        assert low == 2
-        assert high == 2
+        assert low == 3
+        assert high == 3
         assert worlds == 1
         assert len(got) == 40 + size
         assert EnvSpec.from_json(got[40:].decode()) == replace(
@@ -450,7 +450,7 @@ class Hand:
     def state(self, sequence: int) -> tuple[float, tuple[float, ...], tuple[float, ...], int, int]:
         got = self.next()
         assert len(got) == 72 + 8 * 21
-        assert got[:4] == b"\xa7\x52\x02\x04"
+        assert got[:4] == b"\xa7\x52\x03\x04"
         assert struct.unpack_from("<QQ", got, 8) == (self.session, sequence)
         time, nonce = struct.unpack_from("<dQ", got, 24)
         assert time == pytest.approx(0.02 * (sequence - 1))
@@ -487,7 +487,7 @@ def junk(hand: Hand, sequence: int) -> list[bytes]:
         command(session, sequence, 0.5, 1, (1, 2)),
     ]
     bodies = [
-        datagram(5, session, sequence, good[24:], version=3),
+        datagram(5, session, sequence, good[24:], version=4),
         datagram(5, session, sequence, struct.pack("<I4xf4xB", 1, 0, 0)),
         datagram(5, session, sequence, struct.pack("<I4xf4xB", 2**32 - 1, 0, 0)),
         datagram(5, session, sequence, struct.pack("<I4x2f2B", 0, 0, 0, 0, 0)),
@@ -582,7 +582,7 @@ def test_simulator_ends_as_the_rules_say(simulator: list[str]) -> None:
     with udp() as sock, running(simulator, place(sock.getsockname())) as process:
         hand = Hand(sock)
         hand.hello()
-        hand.send(datagram(3, hand.session, 0, text_field("too old"), version=3))
+        hand.send(datagram(3, hand.session, 0, text_field("too old"), version=4))
         status, out, _ = ended(process)
         assert status == 1
         assert out.splitlines()[0] == "refused by the agent: too old"

@@ -102,7 +102,8 @@ class SessionVerdict:
         if command is None:
             number = state.sequence - 1
             raise InputError(f"expected Command {number} before it, got none of that number")
-        self._loop.advance(command.actions, command.resets, command.seeds, command.frozen)
+        resets = command.resets
+        self._loop.advance(command.actions, resets, command.seeds, command.frozen, command.asks)
         return self._loop
 
     def _make(self) -> Steppable:

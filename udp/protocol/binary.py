@@ -13,7 +13,7 @@ import numpy as np
 
 from ...models.errors import InputError
 from .errors import DecodeError, VersionMismatch
-from .layout import Layout, Record
+from .layout import Array, Layout, Record
 from .messages import (
     MAX_SPEC,
     MAX_TEXT,
@@ -32,7 +32,7 @@ from .messages import (
 )
 
 MAGIC = b"\xa7R"  # not UTF-8, so that no text datagram begins with it
-VERSION = 2
+VERSION = 3
 HEADER_SIZE = 24
 
 HELLO = 1
@@ -67,7 +67,7 @@ _HELLO_BODY = struct.Struct("<BB2xII4x")
 _WELCOME_BODY = struct.Struct("<QQBB6x")
 _REST_AT = 8  # first byte after the checksum
 _STATE_HEAD = struct.Struct("<QQdQ")  # session and sequence too
-_COMMAND_HEAD = struct.Struct("<QQI4x")
+_COMMAND_HEAD = struct.Struct("<QQII")
 _MISSING_BODY = struct.Struct("<BxHH")
 _EXTENSION = struct.Struct("<HH")
 _START = {kind: MAGIC + bytes((VERSION, kind)) for kind in (STATE, COMMAND)}
@@ -191,16 +191,15 @@ def encode_step(m: State | Command, layout: Layout) -> bytes:
         time = m.time
         pieces = [_STATE_HEAD.pack(m.session, m.sequence, time, m.nonce)]
         arrays = (*m.observations, m.rewards, m.terminated, m.truncated, *m.telemetry)
-    elif m.seeds is None:
-        kind = COMMAND
-        record = layout.command
-        pieces = [_COMMAND_HEAD.pack(m.session, m.sequence, 0)]
-        arrays = (m.actions, m.orders)
     else:
         kind = COMMAND
-        record = layout.seeded_command
-        pieces = [_COMMAND_HEAD.pack(m.session, m.sequence, layout.drones)]
-        arrays = (m.actions, m.orders, m.seeds)
+        has = (m.seeds is not None, m.asks is not None)
+        record = layout.commands[has]
+        counts = [layout.drones * one for one in has]
+        pieces = [_COMMAND_HEAD.pack(m.session, m.sequence, *counts)]
+        optional = [array for array in (m.seeds, m.asks) if array is not None]
+        arrays = (m.actions, m.orders, *optional)
+        _check_asks(m.asks, layout)
     for slot, array in zip(record.slots, arrays, strict=True):
         if array.shape != slot.shape or array.dtype != slot.dtype:  # numbers are never converted
             raise InputError(
@@ -229,10 +228,11 @@ def _decode_step(
         record = layout.state
         _, _, time, nonce = _STATE_HEAD.unpack_from(data, _REST_AT)
     else:
-        _, _, count = _COMMAND_HEAD.unpack_from(data, _REST_AT)
-        if count not in (0, layout.drones):
-            raise InputError(f"seeds: expected 0 or {layout.drones}, got {count}")
-        record = layout.seeded_command if count else layout.command
+        _, _, *counts = _COMMAND_HEAD.unpack_from(data, _REST_AT)
+        if not {0, layout.drones}.issuperset(counts):
+            raise InputError(f"seeds, requests: expected 0 or {layout.drones}, got {counts}")
+        has_seeds, has_asks = map(bool, counts)
+        record = layout.commands[has_seeds, has_asks]
     if len(data) != record.size:
         raise InputError(f"expected {record.size} bytes, got {len(data)}")
     if wrong := data[record.flags].translate(None, record.legal):
@@ -245,13 +245,16 @@ def _decode_step(
     for slot in record.slots:
         arrays.append(np.ndarray(slot.shape, slot.dtype, data, slot.at))
     if kind == COMMAND:
-        actions, orders, *seeds = arrays
+        actions, orders, *optional = arrays
+        asks = optional[-1] if has_asks else None
+        _check_asks(asks, layout)
         return Command(
             session=session,
             sequence=sequence,
             actions=actions,
             orders=orders,
-            seeds=seeds[0] if seeds else None,
+            seeds=optional[0] if has_seeds else None,
+            asks=asks,
         )
     first = len(layout.observation)
     return State(
@@ -286,6 +289,13 @@ def _check_numbers(data: bytes, time: float, record: Record, layout: Layout) -> 
         if beyond.any():
             most = layout.choices - 1
             raise InputError(f"action: expected a choice 0 to {most}, got {actions[beyond][0]}")
+
+
+def _check_asks(asks: Array | None, layout: Layout) -> None:
+    """Raises `InputError` for a request of what the spec does not offer."""
+    if asks is not None and (wrong := asks & ~np.uint64(layout.asked_bits)).any():
+        offered = f"{layout.asked_bits:#x}" if layout.asked_bits else "none"
+        raise InputError(f"requests: expected bits of {offered}, got {wrong.max():#x}")
 
 
 def _wrong_flags(wrong: bytes, record: Record) -> InputError:

@@ -227,7 +227,7 @@ class Client:
         self.tap: Tap | None = None
         self._dice = Random(self.hello.spec) if self.config.drop else None  # others for each agent
         self.is_queued = False
-        self._assembler = Assembler(self.layout.seeded_command.size)
+        self._assembler = Assembler(self.layout.commands[True, True].size)
         self._transfer = Transfer(b"", self.largest)  # of the message that was sent last
         self._asking = b""  # the datagram that was sent last and wants an answer
         self.outgoing: list[bytes] = []
@@ -469,7 +469,7 @@ class Client:
         """Say Hello in a new session to an agent that knows nothing of this one, or is silent."""
         self.hello = replace(self.hello, session=self.draw_session())
         self._sealing = self.key
-        self._assembler = Assembler(self.layout.seeded_command.size)
+        self._assembler = Assembler(self.layout.commands[True, True].size)
         self._send(self.hello, now)
 
     # ---- what is sent

@@ -8,6 +8,7 @@ import math
 import struct
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import product
 from typing import NamedTuple
 
 import numpy as np
@@ -69,8 +70,8 @@ class Layout:
 
     Attributes:
         state: Observations, rewards (float64), terminated, truncated (bool), telemetry (float64).
-        command: Actions (N, *shape), or int64 of shape (N,) if discrete; orders (uint8).
-        seeded_command: The same with seeds (uint64).
+        commands: Actions (N, *shape), or int64 of shape (N,) if discrete; orders (uint8); then, by
+            whether it has them, seeds and requests (uint64).
 
     Raises:
         InputError: The drones are too many, or a message would be larger than `MAX_MESSAGE`.
@@ -84,6 +85,8 @@ class Layout:
     """None if actions are discrete."""
     choices: int = 0
     """Discrete actions are 0 ... choices - 1; 0 if actions are an array."""
+    asked_bits: int = 0
+    """Of the events that may be asked for."""
     telemetry: tuple[tuple[tuple[int, ...], str], ...] = ()
     """Shape and frame of each telemetry array of one drone; the text codec converts by them."""
 
@@ -103,14 +106,16 @@ class Layout:
         self.telemetry_slots = slots[first + 3 :]
 
         actions = self.action or ArrayLayout((), "int64")
-        arrays = [actions, ArrayLayout((), "uint8"), ArrayLayout((), "uint64")]
-        slots = _slots(COMMAND_ARRAYS_AT, drones, arrays)
-        self.actions, orders, _ = slots
-        flags = slice(orders.at, orders.end)
-        floats = _numbers(slots[:1]) if self.action else None
-        self.command = Record(slots[:2], orders.end, flags, b"\0\1\2", floats)
-        self.seeded_command = self.command._replace(slots=slots, size=slots[-1].end)
-        size = max(self.state.size, self.seeded_command.size)
+        number = ArrayLayout((), "uint64")
+        self.commands: dict[tuple[bool, bool], Record] = {}
+        for has in product((False, True), (False, True)):
+            arrays = [actions, ArrayLayout((), "uint8"), *[number] * sum(has)]
+            slots = _slots(COMMAND_ARRAYS_AT, drones, arrays)
+            self.actions, orders, *_ = slots
+            flags = slice(orders.at, orders.end)
+            floats = _numbers(slots[:1]) if self.action else None
+            self.commands[has] = Record(slots, slots[-1].end, flags, b"\0\1\2", floats)
+        size = max(self.state.size, self.commands[True, True].size)
         if size > MAX_MESSAGE:
             raise InputError(
                 f"expected States and Commands of at most {MAX_MESSAGE} bytes, got {size}"

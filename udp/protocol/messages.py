@@ -62,7 +62,7 @@ class Hello:
     """The `EnvSpec` as JSON."""
     worlds: int = 1
     """Number of worlds W, each with every drone of the spec."""
-    versions: tuple[int, int] = (2, 2)
+    versions: tuple[int, int] = (3, 3)
     """Lowest and highest version of the protocol that the simulator speaks."""
     extensions: tuple[Extension, ...] = ()
 
@@ -85,7 +85,7 @@ class Welcome:
     session: int
     nonce: int
     """Random 64-bit number, new for every session: State 1 echoes it, the session's key has it."""
-    version: int = 2
+    version: int = 3
     """Version of all that follows."""
     seed: int | None = None
     """Seed for the simulator's own first reset, where the agent sets one: drone i takes seed + i
@@ -209,6 +209,9 @@ class Command:
     seeds: Array | None = None
     """uint64, shape (N,): seeds of the resets in this command; a drone that is not reset ignores
     its own. None leaves the generators as they are."""
+    asks: Array | None = None
+    """uint64, shape (N,): bit i asks for event i of the spec's `asks`, for a drone that flies. None
+    asks for nothing."""
 
     @property
     def resets(self) -> Array:

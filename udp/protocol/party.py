@@ -45,6 +45,7 @@ class World(Protocol):
         resets: Mask | None,
         seeds: Seeds | None,
         frozen: Mask | None,
+        asks: Seeds | None = None,
     ) -> None: ...
 
 
@@ -257,9 +258,10 @@ class OneAgent(WorldRules):
         if command is None:
             return False
         if command.orders.tobytes() == self._all_fly:
-            self.world.advance(command.actions, None, None, None)
+            self.world.advance(command.actions, None, None, None, command.asks)
         else:
-            self.world.advance(command.actions, command.resets, command.seeds, command.frozen)
+            resets = command.resets
+            self.world.advance(command.actions, resets, command.seeds, command.frozen, command.asks)
         self.cause = command
         self._to_follow = None
         self._due.append(self._link)
@@ -349,6 +351,7 @@ class SeveralAgents(WorldRules):
     def _fly(self, flying: Links) -> None:
         """Fly the world for one control period."""
         actions = neutral(self.layout)
+        asks = np.zeros(self.layout.drones, np.uint64)
         staying = []
         for link in flying:
             assert link.command is not None
@@ -357,10 +360,14 @@ class SeveralAgents(WorldRules):
             else:
                 staying.append(link)
                 actions[link.rows] = link.command.actions
+                if link.command.asks is not None:
+                    asks[link.rows] = link.command.asks
         self.steps += 1
         orders = np.full(self.layout.drones, FLY, np.uint8)
-        self.cause = Command(session=0, sequence=self.steps, actions=actions, orders=orders)
-        self.world.advance(actions, None, None, None)
+        self.cause = Command(
+            session=0, sequence=self.steps, actions=actions, orders=orders, asks=asks
+        )
+        self.world.advance(actions, None, None, None, asks)
         for link in staying:
             self._queue(link)
 

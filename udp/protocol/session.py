@@ -99,6 +99,7 @@ class Session:
         orders: Array,
         seeds: Array | None,
         now: float,
+        asks: Array | None = None,
     ) -> None:
         """Answer the last State.
 
@@ -112,6 +113,7 @@ class Session:
             actions=actions,
             orders=orders,
             seeds=seeds,
+            asks=asks,
         )
         data = text.encode(command) if self.is_text else binary.encode_step(command, self.layout)
         self.state = after

@@ -108,8 +108,8 @@ def encode(message: State | Command | Close, layout: Layout | None = None) -> by
         case Command() if message.orders.item() == RESET:
             fields = ["reset"] if message.seeds is None else ["reset", str(message.seeds.item())]
         case Command():
-            if message.orders.item() != FLY:
-                raise InputError("text codec: expected an action or a reset, got a frozen drone")
+            if message.orders.item() != FLY or message.asks is not None:
+                raise InputError("text codec: expected an action or a reset, got another order")
             fields = _numbers([message.actions])
         case Close():
             fields = ["close"]

@@ -32,8 +32,8 @@ from .sockets import LONGEST_WAIT, PAUSE, Port
 if TYPE_CHECKING:
     from ..journal import Journal
 
-Order = tuple[Array, Array, Array | None]
-"""Actions, orders and seeds of the drones of one simulator: see `messages.Command`."""
+Order = tuple[Array, Array, Array | None, Array | None]
+"""Actions, orders, seeds and requests of the drones of one simulator: see `messages.Command`."""
 
 
 class AgentSettings(TypedDict, total=False):
@@ -198,10 +198,10 @@ class Agent:
         of the layout, or not finite, and nothing was sent; otherwise as `connect`.
         """
         now = time.monotonic()
-        for slot, (actions, what, seeds) in orders.items():
+        for slot, (actions, what, seeds, asks) in orders.items():
             session = self.server.slots[slot]
             assert session is not None
-            session.send_command(actions, what, seeds, now)
+            session.send_command(actions, what, seeds, now, asks)
         self.lost = [""] * len(self.lost)
         self._gather(self._pending() if None in self.server.slots else list(orders))
 

@@ -72,6 +72,8 @@ class Simulator(NotCopied):
         config: Times of the exchange. `timeout`: longest wait for an agent that is to come, or to
             come back, s.
         key_file: As `AgentSettings`, and so are `insecure` and `record`.
+        allow_events: Whether agents may ask for the events that the config offers: those on this
+            machine, or with a key.
         patience: Longest wait for a Command of one of several agents, s.
         free_run: Keep time instead of lock-step, with one agent.
         keywords: As of `EnvConfig.from_keywords`, with an id: `drones` of each world, `vehicle` …
@@ -105,6 +107,7 @@ class Simulator(NotCopied):
         key_file: Path | str | None = None,
         insecure: bool = False,
         record: Path | str | None = None,
+        allow_events: bool = False,
         patience: float = 10.0,
         free_run: FreeRun | None = None,
         **keywords: object,
@@ -118,11 +121,13 @@ class Simulator(NotCopied):
             if by_text or record or num_envs:
                 raise InputError("agents: expected neither text, record nor num_envs with several")
         key = Key(read_key(key_file), "simulator") if key_file else None
-        insecure = insecure or key is not None
         with ExitStack() as failing:  # closes what is open if a later step fails
             self.stepped = stepped = make_stepped(env, num_envs, keywords)
             failing.callback(stepped.close)
             self.spec = spec = with_age(stepped.spec) if free_run else stepped.spec
+            if not allow_events:
+                self.spec = spec = replace(spec, asks=())
+            insecure = key is not None or (insecure and not spec.asks)
             worlds = stepped.num_envs // len(spec.agents)
             layout = layout_of(spec, worlds)
             servers = [server] if agents is None else list(agents)

@@ -93,6 +93,7 @@ class GymnasiumWorld:
         resets: Mask | None,
         seeds: Seeds | None,
         frozen: Mask | None,
+        asks: Seeds | None = None,
     ) -> None:
         is_reset = resets is not None and resets.all()
         is_frozen = frozen is not None and frozen.all()
