@@ -49,6 +49,7 @@ set simplified_pids_mode = OFF
 set yaw_motors_reversed = ON
 set tpa_rate = 0
 set throttle_boost = 0
+set anti_gravity_gain = 0
 set angle_feedforward = 0
 mixer CUSTOM
 mmix reset
@@ -64,13 +65,13 @@ _PER_P: Final = math.degrees(0.032029) / 1000.0
 
 
 def configuration(
-    vehicle: Vehicle, propellers: Propellers, gains: Gains, full_rates: Floats
+    vehicle: Vehicle, propellers: Propellers, gains: Gains, full_rates: Floats, matches: bool
 ) -> Iterator[str]:
     """Commands of its CLI for a vehicle: the mixer, with motors in the order of the rotors, the
     rates of full sticks, °/s, shape (3,), and the gains, by those of our loops.
 
-    They make its rate loops of roll and pitch as fast on this vehicle as the defaults do on a
-    racer, slower by as much as the rotors' lag is longer.
+    Its rate loops of roll and pitch are as fast on this vehicle as the defaults are on a racer,
+    slower where the rotors' lag is longer. If it `matches` they are as fast as our loops.
     """
     yield from _CONFIG.splitlines()
     mix = right_inverse(vehicle.allocation)[:, 1:]
@@ -82,11 +83,12 @@ def configuration(
     settings = {"angle_p_gain": 10.0 * gains.attitude, "iterm_relax_cutoff": 15.0 / slower}
     torques = vehicle.allocation[1:] * propellers.slope * mix.T
     per_ps = torques.sum(axis=1) / vehicle.inertia.diagonal() * _PER_P
-    fast = min(_RATE_GAIN / slower**0.7, _FASTER * gains.rate[0])
+    fast = gains.rate[0] if matches else min(_RATE_GAIN / slower**0.7, _FASTER * gains.rate[0])
+    integral = 1.8 * (fast / _RATE_GAIN) ** 3
     rates = fast, fast, gains.rate[2]
     for name, rate, per_p, full in zip(_AXES, rates, per_ps, full_rates, strict=True):
         p = rate / per_p
-        settings |= {f"p_{name}": p, f"i_{name}": 1.8 * p / slower**2, f"f_{name}": 0.0}
+        settings |= {f"p_{name}": p, f"i_{name}": integral * p, f"f_{name}": 0.0}
         settings[f"{name}_rc_rate"] = full / 10.0
         if name != "yaw":
             settings |= dict.fromkeys((f"d_{name}", f"d_max_{name}"), 0.7 * p * slower)
@@ -135,15 +137,16 @@ class Running(Program):
                 for command in commands:
                     _told(link, command)
                 _told(link, "save", "Rebooting")
+            memory = (self.folder / _MEMORY).read_bytes()
         except OSError as error:
             raise PeerSilent(f"betaflight: expected its CLI, got none: {error}") from None
-        return Firmware(version, (self.folder / _MEMORY).read_bytes())
+        return Firmware(version, memory)
 
     def _connected(self) -> socket.socket:
         deadline = time.monotonic() + ANSWER
         while True:
             try:
-                return socket.create_connection((HOST, protocol.CLI_PORT + self.apart), ANSWER)
+                return socket.create_connection((HOST, protocol.CLI_PORT + self.apart), 0.5)
             except ConnectionRefusedError:  # it does not listen yet
                 if self._path and time.monotonic() > deadline:
                     raise
@@ -154,10 +157,17 @@ def _told(link: socket.socket, command: str, end: str = "# ") -> str:
     """The answer of its CLI to a command."""
     link.sendall(f"{command}\r\n".encode())
     answer = ""
+    deadline = time.monotonic() + ANSWER
     while not answer.endswith(end):
-        part = link.recv(4096)
+        try:
+            part = link.recv(4096)
+        except TimeoutError:
+            if time.monotonic() > deadline:
+                raise
+            link.sendall(b"\r\n")  # it may keep its last words until it has more to say
+            continue
         if not part:
-            raise ConnectionResetError("it ended")
+            break
         answer += part.decode(errors="replace")
     if "###ERROR" in answer:
         raise InputError(f"betaflight: expected that it takes {command!r}, got {answer.strip()!r}")
@@ -190,7 +200,8 @@ class Betaflight:
         self._sticks_every = round(self._pilot.period * protocol.RATE)
         gains = self._pilot.gains
         full = 10.0 * np.clip(np.ceil(np.degrees(gains.most_rate) / 10.0), 1.0, 199.0)
-        commands = tuple(configuration(vehicle, self._propellers, gains, full))
+        matches = pilot is not None and pilot.matches
+        commands = tuple(configuration(vehicle, self._propellers, gains, full, matches))
         version, memory = configured(program, commands, not real_time)
         if not self._pilot.acro:
             full[:2] = FULL_ANGLE

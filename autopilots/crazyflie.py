@@ -100,9 +100,9 @@ class Crazyflie:
         self._program = Program("crazyflie", protocol.PORT, (protocol.CLIENT_PORT,), apart=1)
         number = self._program.number
         self._client = Client(self._program, protocol.CLIENT_PORT + number)
-        environment = {}
-        if not self._real_time:
-            environment["LD_PRELOAD"] = str(compiled(_SOURCE, self._program.folder))
+        environment = {"LD_PRELOAD": str(compiled(_SOURCE, self._program.folder))}
+        if self._real_time:
+            environment["ROTORGRAM_OWN_CLOCK"] = "1"
         self._program.start(program, [str(protocol.PORT + number), HOST], environment)
         self._program.meet(protocol.check_greeting)
         self._program.send(protocol.HELLO)

@@ -10,7 +10,8 @@
  * Datagrams that were collected are what the program's task of the link then reads.
  *
  * The firmware takes a tick for 32 bits where FreeRTOS has 64: a variable on the stack of its loop
- * has upper bits that nothing sets, and in some runs it never begins. So a task begins on zeros.
+ * has upper bits that nothing sets, and in some runs it never begins. So a task begins on zeros. This
+ * alone is what the library does where ROTORGRAM_OWN_CLOCK is set.
  */
 #define _GNU_SOURCE
 #include <arpa/inet.h>
@@ -19,6 +20,7 @@
 #include <poll.h>
 #include <pthread.h>
 #include <signal.h>
+#include <stdlib.h>
 #include <string.h>
 #include <sys/socket.h>
 #include <sys/syscall.h>
@@ -33,6 +35,7 @@ static long now; /* ns */
 static void (*tick)(int);
 static pthread_t threads[2], idle; /* the last two that were created */
 static int started;
+static int own_clock; /* whether the program keeps its own clock */
 
 static int link_socket = -1;
 static struct sockaddr_in simulator;
@@ -51,6 +54,7 @@ static ssize_t (*receive)(int, void *, size_t, int, struct sockaddr *, socklen_t
 
 __attribute__((constructor)) static void begin(void)
 {
+    own_clock = getenv("ROTORGRAM_OWN_CLOCK") != NULL;
     create = dlsym(RTLD_NEXT, "pthread_create");
     set_mask = dlsym(RTLD_NEXT, "pthread_sigmask");
     set_action = dlsym(RTLD_NEXT, "sigaction");
@@ -115,12 +119,12 @@ int setitimer(__itimer_which_t which, const struct itimerval *value, struct itim
 {
     idle = threads[0];
     started = 1;
-    return 0;
+    return own_clock ? (int)syscall(SYS_setitimer, which, value, old) : 0;
 }
 
 int sigaction(int number, const struct sigaction *action, struct sigaction *old)
 {
-    if (number != SIGALRM)
+    if (number != SIGALRM || own_clock)
         return set_action(number, action, old);
     tick = action->sa_handler;
     return 0;
@@ -143,14 +147,14 @@ int pthread_sigmask(int how, const sigset_t *signals, sigset_t *old)
     if (!started || begun || how != SIG_UNBLOCK)
         return status;
     begun = 1;
-    if (pthread_equal(pthread_self(), idle))
+    if (!own_clock && pthread_equal(pthread_self(), idle))
         run_idle_task();
     return with_clear_stack(status);
 }
 
 int clock_gettime(clockid_t clock, struct timespec *time)
 {
-    if (clock != CLOCK_MONOTONIC)
+    if (clock != CLOCK_MONOTONIC || own_clock)
         return (int)syscall(SYS_clock_gettime, clock, time);
     time->tv_sec = now / SECOND;
     time->tv_nsec = now % SECOND;
@@ -159,7 +163,8 @@ int clock_gettime(clockid_t clock, struct timespec *time)
 
 int bind(int socket, const struct sockaddr *address, socklen_t size)
 {
-    link_socket = socket;
+    if (!own_clock)
+        link_socket = socket;
     return (int)syscall(SYS_bind, socket, address, size);
 }
 

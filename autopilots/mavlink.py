@@ -4,7 +4,7 @@ import socket
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import suppress
-from typing import Final, TypeVar
+from typing import Final, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,7 +14,6 @@ from ..envs.spec import EnvSpec
 from ..flights.trajectories import Flights
 from ..models import InputError
 from ..udp.protocol.client import Address
-from ..udp.protocol.party import World
 from ..udp.transport.sockets import resolve
 from .protocol import frames
 
@@ -37,6 +36,18 @@ _TYPES: Final = {4: common.MAV_TYPE_QUADROTOR, 6: common.MAV_TYPE_HEXAROTOR}
 _ACTUATORS: Final = 32  # of a message
 _CELLS: Final = 10
 _UNKNOWN: Final = 65535
+
+
+class Flown(Protocol):
+    """Drones of several worlds after a step, shape (N, ...)."""
+
+    rewards: Array
+    terminated: Mask
+    truncated: Mask
+
+    @property
+    def telemetry(self) -> Mapping[str, Array]:
+        """By name."""
 
 
 class MavlinkOut:
@@ -66,7 +77,7 @@ class MavlinkOut:
         self._socket.connect(there)
         self._links = [common.MAVLink(self, drone + 1, 1) for drone in drones]
 
-    def __call__(self, flown: World, begun: Mask | None) -> None:
+    def __call__(self, flown: Flown, begun: Mask | None) -> None:
         """Look at drones after a step, in which some episodes began, shape (N,)."""
         if begun is not None:
             self.say(begun, "begins")
@@ -117,7 +128,7 @@ class MavlinkOut:
         self._socket.close()
 
 
-def _rows_of(flown: World) -> Iterator[Row]:
+def _rows_of(flown: Flown) -> Iterator[Row]:
     telemetry = flown.telemetry
     for drone in range(len(flown.rewards)):
         yield {name: values[drone] for name, values in telemetry.items()}

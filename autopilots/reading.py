@@ -65,24 +65,28 @@ class Propellers:
 
     def __init__(self, config: EnvConfig, vehicle: Vehicle) -> None:
         curve = vehicle.coefficients["rotors.curve"] or (0.0, 0.0, 1.0)
-        self._own = np.polynomial.Polynomial(curve)
+        own = np.polynomial.Polynomial(curve)
         self._asked = (0.0, 1.0) if config.effects.thrust_curve else tuple(curve)
         self._high = vehicle.thrust_high
         self._throttles = np.linspace(0.0, 1.0, 1025)
-        self._shares = self._own(self._throttles)
+        self._shares = own(self._throttles)
         hover = float(vehicle.hover_thrust.sum() / vehicle.thrust_high.sum())
         self.hover = self.throttle(hover)
-        self.slope: Floats = self._high * self._own.deriv()(self.hover)
+        self.slope: Floats = self._high * own.deriv()(self.hover)
         bend = self._throttles * (self._throttles - 1.0)
         over = self._shares - self._throttles
         self.expo = float(bend @ over / (bend @ bend))
 
     def commands(self, throttles: Floats) -> Floats:
         """Commands of the rotors, N, at throttles from 0 to 1, shape (R,)."""
-        share = np.zeros_like(throttles)
+        share = 0.0 * throttles
         for coefficient in reversed(self._asked):
             share = share * throttles + coefficient
-        return np.asarray(self._high * share)
+        return self._high * share
+
+    def lift(self, throttles: Floats) -> float:
+        """Sum of the rotors' thrusts at throttles, N."""
+        return float(self._high @ np.interp(throttles, self._throttles, self._shares))
 
     def throttle(self, share: float) -> float:
         """At which a rotor gives a share of its largest thrust."""

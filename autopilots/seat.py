@@ -138,7 +138,8 @@ class Seat:
             order = self._instruments.order(seen, reading)
             try:
                 told = self._instruments.seen(seen, reading, order)
-                return self._step(stack, reading, order, told)
+                throttle = self._step(stack, reading, order, told)
+                return self._propellers.commands(throttle)
             except (PeerClosed, PeerSilent, InputError) as error:
                 self.tally.faults.append(f"{error}; after {self._time - self.lifted_after:.3f} s")
                 self._failed = True
@@ -150,12 +151,13 @@ class Seat:
         assert stack is not None
         weight = self._vehicle.mass * self._vehicle.gravity
         lift = 0.0
+        stands = self._instruments.standing(observation, self._time)
         while lift < LIFTED * weight:
-            reading = self._instruments.standing(observation, self._time)
+            reading = stands._replace(time=self._time)
             order = None
             if stack.ready:
                 order = Order(reading.position, heading_of(reading.quaternion), stands=True)
-            lift = self._step(stack, reading, order, observation).sum()
+            lift = self._propellers.lift(self._step(stack, reading, order, observation))
             if self._time > LONGEST_STAND:
                 raise InputError(
                     f"autopilot: expected that it lifts the craft within {LONGEST_STAND:g} s of "
@@ -166,16 +168,16 @@ class Seat:
     def _step(
         self, stack: Stack, reading: Reading, order: Order | None, observation: Any
     ) -> Floats:
-        """Thrust that is asked of each rotor, N."""
+        """Throttle of each rotor."""
         late = stack.late
         throttle = stack.step(reading, order, observation)
         self.tally.steps += 1
         self.tally.late += stack.late - late
-        if not ((throttle >= 0.0) & (throttle <= 1.0)).all():  # nan is neither
+        if not (throttle.min() >= 0.0 and throttle.max() <= 1.0):  # nan is neither
             got = throttle.tolist()
             raise InputError(f"autopilot: expected throttles from 0 to 1, got {got}")
         self._time += self._period
-        return self._propellers.commands(throttle)
+        return throttle
 
 
 def seated(config: EnvConfig, rate: float) -> EnvConfig:

@@ -38,6 +38,8 @@ class Pilot(NamedTuple):
     policy: Policy
     spec: EnvSpec
     """Of the env that it was trained in."""
+    matches: bool = True
+    """Whether the rate loops are to be as fast as those of that env."""
 
 
 class StickPilot:

@@ -63,7 +63,8 @@ class CompiledLoop(Loop):
         try:
             if flies and self._world.scenery.moves:
                 steps = machine.memory.get("record/kept/steps")
-                self._move_solids(steps + (1 if flew is None else flew))
+                fired = machine.memory.get("record/kept/fired") if any(self._throws) else None
+                self._move_solids(steps + (1 if flew is None else flew), fired)
             results, told = machine.step(sent, flew, begun, record.active, record.asked, seeds)
         except BaseException as error:
             self._settle()  # the physics has gone on

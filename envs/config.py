@@ -365,7 +365,7 @@ class EnvConfig:
             if several and used:
                 raise InputError(f"{name}: expected none with several vehicles, got {used}")
         check_events(self)
-        randomize = self.drawn
+        randomize = Randomization(self.randomize, None)
         settings = self.backend.settings
         _, hidden = solids_around(vehicle, whole.scene)
         check_world(vehicle, self.backend.name, self.effects, randomize, settings, hidden)

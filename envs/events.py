@@ -6,6 +6,7 @@ more: `events.toml` says which. `stages/events.py` makes it happen.
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -15,12 +16,16 @@ from numpy.typing import NDArray
 from ..models.errors import InputError, shortened
 from ..models.fields import Choice, Limits, Text, check, check_names, mapping
 from ..models.files import read_own_toml, read_toml
+from ..scenes.motion import REST
+from ..scenes.obstacles import Obstacle
 from .spec import Values
 
 if TYPE_CHECKING:
+    from ..scenes.solids import Solids
     from .config import EnvConfig
 
 MAX_EVENTS = 64  # each is a bit of a request
+BALL = "obstacle"
 ASKED = "asked"  # condition of an event that happens at an agent's request
 KINDS = read_own_toml(__file__, "events")
 ALWAYS = KINDS.pop("all")
@@ -86,6 +91,16 @@ def asks_of(events: Sequence[Values]) -> tuple[str, ...]:
     return tuple(kinds) if any(kinds) else ()
 
 
+def balls_of(events: Sequence[Values]) -> "Solids":
+    """What events throw, where it hangs before."""
+    from ..scenes.solids import Solids  # it imports MuJoCo
+
+    thrown = [event for event in events if event["kind"] == BALL]
+    balls = [Obstacle(kind="sphere", size=(x["radius"],), position=x["start"]) for x in thrown]
+    motions = [(*x["velocity"], math.inf, *REST[4:]) for x in thrown]
+    return replace(Solids.of_obstacles(balls), motions=np.reshape(motions, (-1, len(REST))))
+
+
 def check_events(config: "EnvConfig") -> None:
     """Refuse by name what an env has not. Raises `InputError`."""
     for number, event in enumerate(config.events):
@@ -95,5 +110,7 @@ def check_events(config: "EnvConfig") -> None:
         sensor = event.get("sensor")
         if sensor and sensor not in config.sensors:
             raise InputError(f"{where}: expected a sensor of the env, got {sensor}, which is off")
+        if event["kind"] == BALL and config.scene.is_file:
+            raise InputError(f"{where}: expected a scene of a name, got {config.scene}")
         if event["kind"] == "goal" and "goal" not in config.task:
             raise InputError(f"{where}: expected a task with the option goal, got {config.env_id}")

@@ -18,6 +18,7 @@ from ..sim.snapshots import Arrays, Snapshot, joined, part_of
 from ..sim.state import ByName, found, is_traced, some
 from .autoreset import Content, Seed, Seeds, Told, checked_seeds
 from .config import EnvConfig
+from .events import BALL, balls_of
 from .pipeline import Pipeline
 from .specification import instruments_of, make_task, spec_of
 from .stages import clock
@@ -76,6 +77,7 @@ class Loop:
             effects=flown.effects,
             randomize=flown.drawn,
             scene=flown.scene,
+            thrown=balls_of(flown.events),
             **backend.settings,
         )
         self.pipeline = pipeline = Pipeline(task, world)
@@ -88,6 +90,7 @@ class Loop:
         self._record = Record(world.shape, task.memory, kept)
         self.num_envs = num_worlds * config.drones
         self.quantities = quantities_of(task)
+        self._throws = [event["kind"] == BALL for event in flown.events]
         self._closed = False
         self._told: Told | None = None
         self._content: Content | None = None
@@ -133,7 +136,8 @@ class Loop:
         pipeline = self.pipeline
         record.rest()
         if flies:
-            self._move_solids(record.steps + (1 if record.flown is None else record.flown))
+            steps = record.steps + (1 if record.flown is None else record.flown)
+            self._move_solids(steps, vars(record).get("fired"))
             try:
                 record.run(record.flown, pipeline.fly)
             except PhysicsError:
@@ -174,11 +178,17 @@ class Loop:
                 f"touches {name}: move one of them"
             )
 
-    def _move_solids(self, steps: Array) -> None:
-        """Move solids to their places after so many control steps of each episode, (W, A)."""
+    def _move_solids(self, steps: Array, fired: Array | None) -> None:
+        """Move solids to their places after so many control steps of each episode, (W, A); what is
+        thrown has hung in the air until its event, (W, A, E).
+        """
         scenery = self._world.scenery
+        period = self._task.control_period
         if scenery.moves:
-            scenery.move(steps >= 0, self._task.control_period * steps[:, 0])
+            starts = None
+            if fired is not None and any(self._throws):
+                starts = period * fired[..., self._throws].min(axis=1)
+            scenery.move(steps >= 0, period * steps[:, 0], starts)
 
     def _begin(self, begun: Mask, seeds: Seeds | None) -> None:
         """Begin episodes: the task sets the start, and the other stages follow from it."""
@@ -280,7 +290,8 @@ class Loop:
         for stage in self.pipeline.stages:
             stage.restore(record, part_of(state, type(stage).__name__))
             if stage is self.pipeline.flight and not is_traced(record.steps):
-                self._move_solids(record.steps)  # before what measures distances
+                # before what measures distances
+                self._move_solids(record.steps, vars(record).get("fired"))
 
     def __reduce__(self) -> Any:
         return type(self), (self.config, self._record.shape[0]), self.snapshot()

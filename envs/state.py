@@ -1,7 +1,7 @@
 """The state that a task sees."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -25,7 +25,7 @@ class State(WorldState):
     distance: Callable[[Array], Array]
     """From points, world frame, m, (W, n, 3), to the nearest solid but level ground of each world,
     m, (W, n): as `clearance`, without the sphere."""
-    parameters: ByName
+    parameters: ByName = field(default_factory=dict)
     """What is drawn for the episode and what events have changed, by name, shape (W, A)."""
     neighbours: NDArray[np.float64] | None = None
     """What each drone has heard of its neighbours, see `stages/radio.py`: shape (W, A, k, 7)."""

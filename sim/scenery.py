@@ -54,18 +54,26 @@ class Scenery(Kept):
     arrays = ("seeds",)
 
     def __init__(
-        self, scene: SceneConfig, own: Solids, worlds: int, hidden: Sequence[str] = ()
+        self,
+        scene: SceneConfig,
+        own: Solids,
+        worlds: int,
+        hidden: Sequence[str] = (),
+        thrown: Solids | None = None,
     ) -> None:
-        """`own`: what stands in every layout, of the vehicle's file."""
+        """`own`: what stands in every layout, of the vehicle's file; `thrown`: what `move` throws
+        there.
+        """
+        self._thrown = thrown or Solids.none()
         self.scene = scene
         self.hidden = hidden
-        self.moves = scene.type.moves
+        self.moves = scene.type.moves or len(self._thrown) > 0
         self.given = [one.seed for one in scene.given_scenes]
         self.seeds: Array = np.full(worlds, self.given[0] if self.given else -1, np.int64)
         self.which: Array = np.zeros(worlds, np.int64)
         self._always = Solids.ground() + own
         laid = [self.solids(seed) for seed in self.given]
-        self.most: int = max(map(len, laid), default=scene.values.most)
+        self.most: int = max(map(len, laid), default=scene.values.most + len(self._thrown))
         self.layouts = Layouts.of(*[self._always + one for one in laid])
         self.openings: Array = np.zeros((worlds, *drafted(scene, 0).ways.shape))
         opened = [drafted(scene, seed).ways for seed in self.given]
@@ -86,7 +94,7 @@ class Scenery(Kept):
 
     def solids(self, seed: int) -> Solids:
         """What stands in a layout, without ground and `own`."""
-        return Solids.of_layout(self.scene, seed)
+        return self._thrown + Solids.of_layout(self.scene, seed)
 
     @property
     def varies(self) -> bool:
@@ -128,13 +136,15 @@ class Scenery(Kept):
             self._lay(np.flatnonzero((seeds != old) & (seeds >= 0)))
         self._point()
 
-    def move(self, mask: Array, time: Array) -> None:
+    def move(self, mask: Array, time: Array, starts: Array | None = None) -> None:
         """Solids of the worlds of a mask, (W, A), go from where they are to where they are at times
-        of their episodes, s, (W,): straight ahead.
+        of their episodes, s, (W,): straight ahead. What is thrown starts at times, s, (W, T).
         """
         if not self.moves:
             return
         self._frozen = None
+        if starts is not None:
+            self._motions[:, : len(self._thrown), 3] = starts
         rows = np.flatnonzero(mask[:, 0])
         centers = self._places[rows] + offsets(self._motions[rows], time[rows, None])
         centers = centers.transpose(0, 2, 1)
@@ -234,7 +244,8 @@ class Scenery(Kept):
         count = len(self.seeds)
         drafts = [drafted(self.scene, seed) for seed in self.seeds[worlds].tolist()]
         self.openings[worlds] = [self._checked(draft.ways) for draft in drafts]
-        made = dict(zip(worlds.tolist(), Solids.of_drafts(drafts), strict=True))
+        layouts = [self._thrown + solids for solids in Solids.of_drafts(drafts)]
+        made = dict(zip(worlds.tolist(), layouts, strict=True))
         old = self.layouts.kinds
         largest = max(len(one.columns) for one in made.values())
         most = max(old.shape[1], len(self._always.columns) + largest)

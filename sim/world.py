@@ -22,6 +22,7 @@ from .snapshots import Arrays, Kept, Snapshot, joined, part_of
 from .state import FAR, Array, ByName, InitialState, WorldState, chosen, clip
 
 if TYPE_CHECKING:
+    from ..scenes.solids import Solids
     from .scenery import Scenery
 
 _CLASSES = {"mujoco": "MujocoWorld", "rigid": "RigidWorld"}
@@ -373,9 +374,10 @@ def make_world(
     effects: EffectOptions = NO_EFFECTS,
     randomize: Randomization = FIXED,
     scene: SceneConfig = PLAIN,
+    thrown: "Solids | None" = None,
     **settings: Any,
 ) -> World:
-    """W worlds of `drones` drones each, in layouts of a scene.
+    """W worlds of `drones` drones each, in layouts of a scene, and what is thrown in each.
 
     Settings are `num_threads` of `mujoco`, `dtype` of `rigid`, and `compiled` of both: false for
     NumPy, None for compiled code where llvmlite can make it. Raises `InputError`.
@@ -396,7 +398,7 @@ def make_world(
         settings["compiled"] = wanted is not False and not reason
     module = import_module(f".backends.{backend}", __package__)
     cls = getattr(module, _CLASSES[backend])
-    scenery = Scenery(scene, own, num_worlds, hidden)
+    scenery = Scenery(scene, own, num_worlds, hidden, thrown)
     world: World = cls(
         vehicle, num_worlds, drones=drones, effects=effects, randomize=randomize,
         scenery=scenery, **settings,

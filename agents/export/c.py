@@ -145,10 +145,7 @@ def cost(policy: NetworkPolicy) -> str:
     """What a call takes, in words."""
     program = _Program(policy)
     constants = 4 * sum(values.size for values in program.tables.values())
-    return (
-        f"{program.products:,} products and {program.tanhs:,} tanh a call, "
-        f"{constants:,} bytes of constants, {4 * program.numbers:,} bytes of the stack"
-    )
+    return f"{constants:,} bytes of constants, {4 * program.numbers:,} bytes of the stack"
 
 
 class _Program:
@@ -157,8 +154,6 @@ class _Program:
     Attributes:
         at: Name of the array with the numbers so far, `size` of them.
         functions: Texts of those that the statements call.
-        products: Multiplications by weights in a call.
-        tanhs: Evaluations of tanh, a gate's among them.
         numbers: Length of all arrays that a call declares.
     """
 
@@ -168,7 +163,7 @@ class _Program:
         self.lines: list[str] = []
         self.at = "observation"
         self.size = flat_size(policy.spec)
-        self.products = self.tanhs = self.numbers = 0
+        self.numbers = 0
         write_layers(self, policy.network.layers)
         if policy.actions.discrete:
             self.lines.append("action[0] = 0.0f;")
@@ -185,13 +180,11 @@ class _Program:
 
     def tanh(self, layer: Layer) -> None:
         self._needs(_TANH)
-        self.tanhs += self.size
         self._each(f"{self.at}[i] = rotorgram_tanh({self.at}[i]);")
 
     def _sum(self, weight: Floats, inputs: str) -> str:
         """An affine layer over an array; the name of its outputs."""
         units, size = weight.shape
-        self.products += units * (size - 1)
         outputs = self._array(units)
         table = self._table(weight)
         arguments = f"{table}, {inputs}, {size - 1}, {outputs}, {units}"
@@ -202,7 +195,6 @@ class _Program:
         self._needs(_CONVOLUTION)
         filters = len(layer.weight)
         rows, windows = layer.places[1:].shape
-        self.products += filters * rows * windows
         tables = f"{self._table(layer.weight)}, {self._table(layer.places[1:] - 1)}"
         inputs = f"{rows}, {windows}, {self.at}"
         outputs = self._array(filters * windows)
@@ -226,7 +218,6 @@ class _Program:
     def gru(self, layer: GRU) -> None:
         self._needs(_TANH)
         self._needs(_GRU)
-        self.tanhs += 3 * layer.units
         sums = self._sum(layer.weight, self.at)
         without_bias = np.zeros_like(layer.recurrent[:, :1])
         recurrent = np.concatenate((without_bias, layer.recurrent), axis=1)

@@ -18,6 +18,7 @@ from . import c, finite_policy, metadata
 
 _FILES = ("Makefile", "Kbuild", "oot-config", "rotorgram_controller.c")
 _FOLDER = Path(__file__).with_name("crazyflie_app")
+_NAMES = read_own_toml(str(_FOLDER / "names"), "names")
 _CALLS = 1000
 """Of the controller, per second."""
 _MOTORS = ((1, -1), (-1, -1), (-1, 1), (1, 1))
@@ -64,7 +65,7 @@ def _firmware_macros(spec: EnvSpec, rotors: dict[str, list[float]]) -> Iterator[
         raise InputError(
             f"control_period: expected a whole number of milliseconds, got {spec.control_period} s"
         )
-    frames = _names()["frames"]
+    frames = _NAMES["frames"]
     frame = spec.observation[0].frame
     if frame not in frames:
         raise InputError(
@@ -84,18 +85,9 @@ def _firmware_macros(spec: EnvSpec, rotors: dict[str, list[float]]) -> Iterator[
     yield "#define ROTORGRAM_SOURCES {" + ", ".join(_sources(spec)) + "}"
 
 
-def _names() -> dict[str, dict[str, str]]:
-    return read_own_toml(str(_FOLDER / "names"), "names")
-
-
 def _sources(spec: EnvSpec) -> Iterator[str]:
     """The controller's expression for each number of the observation."""
-    known = {
-        f"{name} {axis}": f"seen.{field}[{place}]"
-        for name, field in _names()["sources"].items()
-        for place, axis in enumerate("xyz")
-    }
-    known |= {f"thrust {i + 1} over hover": f"seen.over[{i}]" for i in range(len(_MOTORS))}
+    known = _NAMES["sources"]
     for array in spec.observation:
         for name in component_names(array):
             if name not in known:
@@ -103,18 +95,18 @@ def _sources(spec: EnvSpec) -> Iterator[str]:
                     "observation: expected numbers that the Crazyflie's firmware knows, "
                     f"got {shortened(name)}"
                 )
-            yield known[name]
+            yield f"seen.{known[name]}"
 
 
 def _rotor_of_motors(rotors: dict[str, list[float]]) -> list[int]:
     """The rotor that is each motor. Raises `InputError` for another kind of craft."""
     signs = np.sign(np.reshape(rotors["positions"], (-1, 3))[:, :2]).astype(int)
     places = [tuple(row) for row in signs.tolist()]
-    if sorted(places) == sorted(_MOTORS) and min(rotors["least"]) >= 0.0:
-        found = [places.index(place) for place in _MOTORS]
-        if [rotors["turns"][rotor] for rotor in found] == [1, -1, 1, -1]:
-            return found
-    raise InputError(
-        "vehicle: expected four rotors that turn as the Crazyflie's do, the front right one "
-        f"anticlockwise, got rotors at {shortened(rotors['positions'])}, of turns {rotors['turns']}"
-    )
+    found = [places.index(place) for place in _MOTORS if place in places]
+    turns = [rotors["turns"][rotor] for rotor in found]
+    if len(places) != 4 or turns != [1, -1, 1, -1] or min(rotors["least"]) < 0.0:
+        raise InputError(
+            "vehicle: expected four rotors that turn as the Crazyflie's do, the front right one "
+            f"anticlockwise, got {len(places)} of turns {rotors['turns']}"
+        )
+    return found

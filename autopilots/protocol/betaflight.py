@@ -45,19 +45,19 @@ def yaw_of(version: tuple[int, int]) -> float:
 
 def state_packet(reading: Reading, time: float, yaw: float) -> bytes:
     """Sensor readings, 18 doubles, with a time stamp, s. The place on earth is left out."""
-    p, q, r = reading.rates
-    x, y, z = reading.specific_force
-    w, i, j, k = reading.quaternion
+    p, q, r = reading.rates.tolist()
+    x, y, z = reading.specific_force.tolist()
+    w, i, j, k = reading.quaternion.tolist()
     altitude = reading.position[2]
     return _STATE.pack(
-        time, p, -q, yaw * r, -x, -y, -z, w, i, -j, -k, *reading.velocity,
+        time, p, -q, yaw * r, -x, -y, -z, w, i, -j, -k, *reading.velocity.tolist(),
         0.0, 0.0, altitude, _PRESSURE,
     )  # fmt: skip
 
 
 def sticks_packet(time: float, channels: Sequence[float]) -> bytes:
     """16 channels, µs from 1000 to 2000: roll, pitch, throttle, yaw, switches."""
-    clipped = np.clip(np.rint(channels), 1000, 2000).astype(int).tolist()
+    clipped = [min(max(round(channel), 1000), 2000) for channel in channels]
     return _STICKS.pack(time, *clipped, *[1000] * (16 - len(clipped)))
 
 
@@ -73,5 +73,5 @@ def throttles(datagram: bytes, motors: int) -> NDArray[np.float64]:
     outputs = np.array(values[:motors])
     if not np.isfinite(outputs).all():
         raise InputError(f"betaflight: expected finite motors, got {outputs.tolist()}")
-    clipped: NDArray[np.float64] = np.clip(outputs / 1000.0 - 1.0, 0.0, 1.0)
-    return clipped
+    throttles: NDArray[np.float64] = (outputs / 1000.0 - 1.0).clip(0.0, 1.0)
+    return throttles

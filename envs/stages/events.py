@@ -9,6 +9,7 @@ from ...sim import Array, World, stack
 from ...sim.snapshots import Arrays
 from ...sim.state import total
 from ..events import ASKED, changes_of, steps_of
+from ..spec import Values
 from ..tasks.task import Task
 from ..telemetry import quantities_of
 from .record import Record, Stage
@@ -32,8 +33,6 @@ class Events(Stage):
         drones = np.arange(world.shape[1])
         whose = [drones == event.get("drone", drones) for event in events]
         self._whose = np.stack(whose, axis=-1)
-        first = np.array([event.get("at", 0.0) for event in events])
-        self._first = np.ceil(first / period - 1e-6)
         self._steps = np.array([steps_of(event, period) for event in events])
         self._changes = changes_of(events, period)
         self._quantities = {
@@ -41,11 +40,11 @@ class Events(Stage):
             for quantity in quantities_of(task)
             for index, name in enumerate(quantity.components)
         }
-        self._conditions = [self._condition(event.get("when")) for event in events]
+        self._conditions = [self._condition(event) for event in events]
 
     def begin(self, record: Record) -> None:
         """Nothing has happened."""
-        record.fired = np.full((*record.shape, len(self._first)), np.inf)
+        record.fired = np.full((*record.shape, len(self._steps)), np.inf)
 
     def act(self, record: Record) -> None:
         """Change what the step that begins is flown with. What is asked for happens at once."""
@@ -64,7 +63,7 @@ class Events(Stage):
         self.record = record
         steps = record.steps[..., None]
         excess = stack([excess() for excess in self._conditions])
-        happens = (excess > 0) & (steps >= self._first) & self._whose
+        happens = (excess > 0) & self._whose
         record.fired = np.where(happens & (record.fired == np.inf), steps, record.fired)
 
     def _change(self, record: Record, steps: Array) -> None:
@@ -73,11 +72,16 @@ class Events(Stage):
         changes = self._changes.items()
         self.world.change({name: total(np.where(lasts, x, 0.0)) for name, x in changes})
 
-    def _condition(self, words: str | None) -> Callable[[], Array]:
-        """Gives by how much a condition holds, (W, A). Raises `InputError` for an unknown name."""
-        if words in (None, ASKED):
-            return lambda: float(words is None)
-        name, sign, number = words.split()
+    def _condition(self, event: Values) -> Callable[[], Array]:
+        """Gives by how much an event is due, (W, A), above 0. Raises `InputError` for an unknown
+        name.
+        """
+        if "at" in event:
+            before = np.ceil(event["at"] / self.task.control_period - 1e-6) - 1.0
+            return lambda: self.record.steps - before
+        if event["when"] == ASKED:
+            return lambda: 0.0
+        name, sign, number = event["when"].split()
         check_names([name], self._quantities, "events: when")
         quantity, index = self._quantities[name]
         scale = 1.0 if sign == ">" else -1.0

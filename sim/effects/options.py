@@ -6,8 +6,6 @@ from ...models import MAX_DRAG
 from ...models.fields import Limits, check_fields, immutable
 
 MAX_WIND = 100.0  # m/s
-WIND = ("wind_x", "wind_y", "wind_z")
-"""Names of the wind that is drawn."""
 PUSH = ("push_x", "push_y", "push_z", "twist_x", "twist_y", "twist_z")
 """Names of a force at a body's origin, world frame, N, and a torque, body frame, N·m."""
 

@@ -1,5 +1,6 @@
 """The Crazyflie's app: built for this machine, it asks for the thrusts that the policy asks for."""
 
+import json
 import shutil
 import subprocess
 from collections.abc import Callable
@@ -198,6 +199,22 @@ def test_it_acts_once_in_a_control_period(built: Callable[[Checkpoint], Path]) -
     assert abs(found[2] - found[1]).max() > 1e-3
 
 
+def test_an_axis_without_a_wanted_position_keeps_the_last(
+    built: Callable[[Checkpoint], Path],
+) -> None:
+    def rows(last: np.ndarray) -> np.ndarray:
+        return np.array([record((0.5, -0.2, 5.0, 30.0), (0.3, 0.2, 4.0)), last])
+
+    program = built(checkpoint_of())
+    elsewhere = record((3.0, 2.0, 4.5, -60.0), (0.3, 0.2, 4.0))
+    elsewhere[0] = 2  # along z alone
+    higher = record((0.5, -0.2, 4.5, 30.0), (0.3, 0.2, 4.0))
+    found = forces(program, rows(elsewhere))
+    np.testing.assert_array_equal(found, forces(program, rows(higher)))
+    elsewhere[0] = 1
+    assert (found[1] != forces(program, rows(elsewhere))[1]).any()
+
+
 REFUSED: dict[str, tuple[dict[str, Any], str]] = {
     "level": ({"action": "rates"}, "action: expected rotors for the firmware's motors, got rates"),
     "number": (
@@ -239,11 +256,9 @@ def test_the_command_writes_a_new_folder(
     out = tmp_path / "app"
     words = ["export", str(file), "--to", "crazyflie", "-o", str(out)]
     assert main(words) == 0
-    # 19 inputs, 16 units, 4 thrusts: 19 · 16 + 16 · 4; biases, and 4 · 4 numbers of the action.
+    # 16 units of 19 inputs and a bias, 4 thrusts of 16 and a bias, and 4 · 4 numbers of the action.
     assert capsys.readouterr().out == (
-        f"app: {out} (6 files)\n"
-        "policy: 368 products and 16 tanh a call, 1,616 bytes of constants, "
-        "80 bytes of the stack\n"
+        f"app: {out} (6 files)\npolicy: 1,616 bytes of constants, 80 bytes of the stack\n"
     )
     files = app(load(file))
     assert {one.name: one.read_bytes() for one in out.iterdir()} == files
@@ -278,3 +293,19 @@ def test_the_first_thrust_carries_the_payload() -> None:
         "rotorgram/PayloadHover-v0", vehicle="crazyflie2", payload_share=0.2
     )
     np.testing.assert_allclose(rotors_of(env)["initial"], [1.2 * HOVER] * 4, rtol=1e-6)
+
+
+def test_the_page_shows_what_the_study_wrote() -> None:
+    page = (ROOT / "docs" / "firmware.md").read_text(encoding="utf-8")
+    content = json.loads((ROOT / "docs" / "results" / "firmware.json").read_text())
+    for seed, flight in content["seeds"].items():
+        error = f"{1000 * flight['firmware, m']:.1f} mm"
+        (row,) = [line for line in page.splitlines() if line.startswith(f"| seed {seed} |")]
+        assert f"| {1000 * flight['simulator, m']:.1f} mm" in row
+        if flight["firmware, crashed"]:
+            assert f"| {flight['firmware, crashed']:.0f} crashed |" in row
+        else:
+            assert f"| {error} | {flight['firmware, s to 0.1 m']:.2f} s |" in row
+    for name, size in content["sizes"].items():
+        if name != "controller, bytes":
+            assert f"| {size:,.0f}" in page, name

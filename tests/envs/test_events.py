@@ -1,5 +1,7 @@
 """Events in flight: each kind against a flight without it, and what all kinds have in common."""
 
+import re
+import tomllib
 from pathlib import Path
 from typing import Any
 
@@ -335,7 +337,7 @@ def test_a_config_goes_through_json_keywords_and_a_file(tmp_path: Path) -> None:
 
 WRONG: list[tuple[str, Any]] = [
     ("events: expected at most 64 tables, got 3", 3),
-    ("expected 'wind' or .* or 'goal', got 'storm'", [{"kind": "storm"}]),
+    ("expected 'wind' or .* or 'obstacle', got 'storm'", [{"kind": "storm"}]),
     (r"events\[0\]: expected at or when, got both or none", [{"kind": "mass", "mass": 1.0}]),
     (r"events\[0\]: expected velocity of a wind, got none", [{"kind": "wind", "at": 1.0}]),
     (r"events\[0\]: expected some of .*, got 'mas'", [{"kind": "mass", "at": 1, "mas": 1}]),
@@ -378,3 +380,96 @@ def test_a_task_whose_goal_is_its_own_moves_none() -> None:
     event = {"kind": "goal", "at": 0.0, "by": (1.0, 0.0, 0.0)}
     with pytest.raises(InputError, match=r"expected a task with the option goal, got .*Waypoints"):
         Loop(EnvConfig.from_keywords("rotorgram/Waypoints-v0", events=[event]))
+
+
+# ---- an obstacle that is thrown
+
+
+BALL = {"kind": "obstacle", "radius": 0.2, "start": (-6.0, 0.0, 20.5), "velocity": (10.0, 0.0, 1.0)}
+
+
+def clearances(
+    event: dict[str, Any], backend: str, *, compiled: bool, restored: bool = False, **more: Any
+) -> list[float]:
+    """From the craft's sphere to the nearest solid, after each step of hovering, m."""
+    options = {"goal": (0.0, 0.0, 20.0), **LEVEL, **more}
+    config = EnvConfig.from_keywords(
+        "rotorgram/Hover-v0", backend=backend, compiled=compiled, events=[event], **options
+    )
+    make = CompiledLoop if compiled else Loop
+    loop = make(config)
+    loop.advance(None, np.ones(1, bool), [5])
+    found = []
+    for step in range(12):
+        if restored and step == 7:
+            snapshot = loop.snapshot()
+            loop.close()
+            loop = make(config)
+            loop.restore(snapshot)
+        loop.advance(HOVER)
+        found.append(float(loop.record.state.clearance[0, 0]))
+    loop.close()
+    return found
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_a_ball_hangs_until_it_is_thrown_and_falls_freely(backend: str) -> None:
+    event = BALL | {"at": 5 * PERIOD}
+    found = clearances(event, backend, compiled=False)
+    radius = EnvConfig.from_keywords("rotorgram/Hover-v0").load_vehicle().radius
+    time = PERIOD * np.maximum(np.arange(1, 13) - 5, 0)
+    x = -6.0 + 10.0 * time
+    z = 0.5 + time - GRAVITY / 2 * time * time
+    assert found == pytest.approx(np.hypot(x, z) - 0.2 - radius, abs=1e-4)
+    assert found == clearances(event, backend, compiled=False, restored=True)
+    assert found == clearances(event, backend, compiled=True)
+    assert found == clearances(event, backend, compiled=True, restored=True)
+
+
+@pytest.mark.parametrize("scene", ["forest:3", "forest:new", "traffic:0-3"])
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_a_ball_flies_in_every_scene(scene: str, backend: str) -> None:
+    """Over the trees, thrown by a condition on the craft."""
+    event = BALL | {"when": "z > 19.0", "start": (-6.0, 0.0, 20.0), "velocity": (10.0, 0.0, 0.0)}
+    found = clearances(event, backend, compiled=False, scene=scene)
+    assert np.diff(found) == pytest.approx(-0.2, abs=0.01)  # 10 m/s for a step
+    assert found == clearances(event, backend, compiled=True, scene=scene)
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_a_ball_that_hits_is_a_contact(backend: str) -> None:
+    event = BALL | {"at": 0.0, "start": (-3.0, 0.0, 20.0), "velocity": (20.0, 0.0, 0.0)}
+    config = EnvConfig.from_keywords(
+        "rotorgram/Hover-v0", backend=backend, events=[event], goal=(0.0, 0.0, 20.0), **LEVEL
+    )
+    loop = Loop(config)
+    loop.advance(None, np.ones(1, bool), [5])
+    steps = 0
+    while not loop.terminated[0] and steps < 20:
+        loop.advance(HOVER)
+        steps += 1
+    assert loop.terminated[0]
+    assert 1 < steps < 9  # of 7.5 to the craft's origin
+    loop.close()
+
+
+def test_no_ball_in_a_scene_of_a_file(tmp_path: Path) -> None:
+    file = tmp_path / "room.toml"
+    file.write_text('[[obstacle]]\nkind = "sphere"\nsize = [1.0]\nposition = [9.0, 0.0, 1.0]\n')
+    with pytest.raises(InputError, match=r"expected a scene of a name, got .*room"):
+        Loop(
+            EnvConfig.from_keywords(
+                "rotorgram/Hover-v0", events=[BALL | {"at": 0.0}], scene=str(file)
+            )
+        )
+
+
+def test_the_page_has_every_kind_and_size() -> None:
+    root = Path(__file__).parents[2]
+    page = (root / "docs" / "events.md").read_text("utf-8")
+    kinds = tomllib.loads((root / "envs" / "events.toml").read_text("utf-8"))
+    always = kinds.pop("all")
+    for kind, sizes in kinds.items():
+        (row,) = [line for line in page.splitlines() if line.startswith(f"| `{kind}` |")]
+        assert all(f"`{size}`" in row for size in sizes)
+    assert all(re.search(rf"\b{name} = |`{name}`", page) for name in always)

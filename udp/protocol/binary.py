@@ -294,8 +294,8 @@ def _check_numbers(data: bytes, time: float, record: Record, layout: Layout) -> 
 def _check_asks(asks: Array | None, layout: Layout) -> None:
     """Raises `InputError` for a request of what the spec does not offer."""
     if asks is not None and (wrong := asks & ~np.uint64(layout.asked_bits)).any():
-        offered = f"{layout.asked_bits:#x}" if layout.asked_bits else "none"
-        raise InputError(f"requests: expected bits of {offered}, got {wrong.max():#x}")
+        offered = layout.asked_bits
+        raise InputError(f"requests: expected bits of {offered:#x}, got {wrong.max():#x}")
 
 
 def _wrong_flags(wrong: bytes, record: Record) -> InputError:

@@ -116,17 +116,15 @@ class Simulator(NotCopied):
         check("patience", Limits(0, unit="s", above=True), patience)
         by_text = codec == "text"
         if agents is not None:
-            if not agents:
-                raise InputError("agents: expected one address or more, got none")
-            if by_text or record or num_envs:
-                raise InputError("agents: expected neither text, record nor num_envs with several")
+            _check_several(agents, by_text, record, num_envs)
         key = Key(read_key(key_file), "simulator") if key_file else None
         with ExitStack() as failing:  # closes what is open if a later step fails
             self.stepped = stepped = make_stepped(env, num_envs, keywords)
             failing.callback(stepped.close)
-            self.spec = spec = with_age(stepped.spec) if free_run else stepped.spec
-            if not allow_events:
-                self.spec = spec = replace(spec, asks=())
+            age = (COMMAND_AGE,) if free_run else ()
+            asks = stepped.spec.asks if allow_events else ()
+            telemetry = (*stepped.spec.telemetry, *age)
+            self.spec = spec = replace(stepped.spec, asks=asks, telemetry=telemetry)
             insecure = key is not None or (insecure and not spec.asks)
             worlds = stepped.num_envs // len(spec.agents)
             layout = layout_of(spec, worlds)
@@ -309,9 +307,12 @@ class Simulator(NotCopied):
             link.tap(0, link.hello, binary.encode(link.hello))
 
 
-def with_age(spec: EnvSpec) -> EnvSpec:
-    """The spec of a simulator that keeps time."""
-    return replace(spec, telemetry=(*spec.telemetry, COMMAND_AGE))
+def _check_several(agents: Sequence[Address], *alone: object) -> None:
+    """Raises `InputError` for no agent, and for what several of them cannot have."""
+    if not agents:
+        raise InputError("agents: expected one address or more, got none")
+    if any(alone):
+        raise InputError("agents: expected neither text, record nor num_envs with several")
 
 
 def _free_running(

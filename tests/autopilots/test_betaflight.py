@@ -1,0 +1,169 @@
+"""Betaflight's SITL in the seat: paths of programs, with ':' between them, in ROTORGRAM_BETAFLIGHT.
+
+Each may be of another release.
+"""
+
+import math
+import os
+import re
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import closing
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import pytest
+from commands import Capsys, output, refused
+from numpy.typing import NDArray
+from rotorgram.agents.policies import Observation
+from rotorgram.autopilots import find_stack
+from rotorgram.autopilots.betaflight import Running
+from rotorgram.autopilots.seat import Seat, Start, seated
+from rotorgram.autopilots.sticks import Pilot
+from rotorgram.envs.config import EnvConfig
+from rotorgram.envs.registry import env_spec
+from rotorgram.envs.vector import LocalVectorEnv
+from rotorgram.models import InputError
+
+PROGRAMS = [Path(path) for path in os.environ.get("ROTORGRAM_BETAFLIGHT", "").split(":") if path]
+STACK = find_stack("betaflight")
+needs_program = pytest.mark.skipif(
+    not PROGRAMS, reason="ROTORGRAM_BETAFLIGHT: expected the path of Betaflight's SITL, got none"
+)
+every_program = pytest.mark.parametrize("program", PROGRAMS, ids=lambda path: path.name)
+
+
+class Asks:
+    """A policy that asks for the same action all the time."""
+
+    def __init__(self, *action: float) -> None:
+        self._action = np.array(action, np.float32)
+
+    def reset(self) -> None:
+        pass
+
+    def act(self, observation: Observation) -> NDArray[np.float32]:
+        return self._action
+
+
+def config_of(**settings: object) -> EnvConfig:
+    options = {"vehicle": "hummingbird", "start_tilt": 0.0, **settings}
+    return EnvConfig.from_keywords("rotorgram/Hover-v0", **options)
+
+
+def flown(
+    program: Path, config: EnvConfig, mode: str, pilot: Pilot | None = None
+) -> Iterator[tuple[Seat, dict[str, NDArray[np.float64]]]]:
+    """The seat and the telemetry after each step of a flight."""
+    inner = seated(config, STACK.rate)
+    start = Start(inner, inner.load_vehicle(), mode, program)
+    make = partial(STACK.make, pilot=pilot) if pilot else STACK.make
+    with closing(LocalVectorEnv(inner, 1, autoreset_mode="Disabled")) as env:
+        observations, _ = env.reset(seed=5)
+        with closing(Seat(env.env_spec, start, make)) as seat:
+            while True:
+                action = seat.act({name: array[0] for name, array in observations.items()})
+                observations, _, terminated, truncated, _ = env.step(action[np.newaxis])
+                yield seat, {name: array[0] for name, array in env.telemetry.items()}
+                if terminated.any() or truncated.any():
+                    return
+
+
+def children() -> set[int]:
+    """Processes that this one has started."""
+    own = Path(f"/proc/{os.getpid()}/task/{os.getpid()}/children")
+    return {int(pid) for pid in own.read_text().split()}
+
+
+@every_program
+def test_flies_to_the_goal_and_repeats_its_hash(program: Path) -> None:
+    words = ("fly", "betaflight", "--program", program, "--vehicle", "hummingbird",
+             "--env", "rotorgram/Hover-v0", "--effects", "motor_lag")  # fmt: skip
+    printed = []
+    for _ in range(2):
+        command = [sys.executable, "-m", "rotorgram", *map(str, words)]
+        done = subprocess.run(command, capture_output=True, text=True, check=True)
+        printed.append(done.stdout)
+        assert "lock-step  all 5,000 steps" in done.stdout
+        error = re.search(r"^steady\s+e (\S+) m", done.stdout, re.MULTILINE)
+        assert error is not None
+        assert float(error[1]) < 0.04
+    hashes = [re.findall(r"^hash\s+(\w{16})$", text, re.MULTILINE) for text in printed]
+    assert len(hashes[0]) == 1
+    assert hashes[0] == hashes[1]
+
+
+@every_program
+def test_rates_in_acro(program: Path) -> None:
+    """A quarter of a turn per second about each axis; that of yaw is reached slowly."""
+    rates = config_of(action="rates", control_period=0.01, episode_length=25)
+    spec = env_spec(rates)
+    for axis, sign in ((0, 1.0), (1, -1.0), (2, 1.0)):
+        action = np.zeros(4)
+        action[1 + axis] = sign * 0.5 * math.pi / spec.action_scale[1 + axis]
+        pilot = Pilot(Asks(*action), spec)
+        *_, (_, last) = flown(program, rates, "acro", pilot)
+        expected = np.zeros(3)
+        expected[axis] = sign * 0.5 * math.pi
+        assert last["body_rates"] == pytest.approx(expected, abs=0.4)
+
+
+@needs_program
+def test_a_killed_program_gives_no_thrust() -> None:
+    """Its rotors stop, the craft falls, and a sentence tells why."""
+    before = children()
+    flight = flown(PROGRAMS[0], config_of(), "angle")
+    for _ in range(200):
+        seat, telemetry = next(flight)
+    assert telemetry["thrust"].min() > 0.1
+    (pid,) = children() - before
+    os.kill(pid, signal.SIGKILL)
+    for _ in range(300):
+        seat, telemetry = next(flight)
+    assert telemetry["thrust"] == pytest.approx(np.zeros(4))
+    assert telemetry["velocity"][2] < -2.0
+    (fault,) = seat.tally.faults
+    assert fault.startswith("betaflight: ended with status -9")
+    flight.close()
+    assert children() == before
+
+
+@needs_program
+def test_two_programs_fly_side_by_side() -> None:
+    config = config_of(episode_length=5)
+    pairs = list(zip(*(flown(PROGRAMS[0], config, "angle") for _ in range(2)), strict=True))
+    (_, first), (_, second) = pairs[-1]
+    assert len(pairs) == 100
+    assert (first["position"] == second["position"]).all()
+
+
+@needs_program
+def test_a_command_that_its_cli_refuses() -> None:
+    refusal = pytest.raises(InputError, match="expected that it takes 'set nonsense = 1', got")
+    with closing(Running(PROGRAMS[0], lockstep=True)) as running, refusal:
+        running.configured(("set nonsense = 1",))
+
+
+@needs_program
+def test_a_policy_of_another_task_is_refused() -> None:
+    config = config_of()
+    spec = env_spec(config.changed(action="rates", history=2))
+    with pytest.raises(InputError, match="policy: expected one of the levels rates, attitude"):
+        next(flown(PROGRAMS[0], config, "acro", Pilot(Asks(0.0), spec)))
+
+
+def test_only_betaflight_has_sticks(capsys: Capsys, tmp_path: Path) -> None:
+    program = tmp_path / "program"
+    program.touch()
+    words = ("fly", "crazyflie", "--program", program, "--policy", "geometric")
+    assert "policy: expected betaflight, which has sticks" in refused(capsys, *words)
+
+
+@needs_program
+def test_a_controller_moves_the_sticks(capsys: Capsys) -> None:
+    words = ("fly", "betaflight", "--program", PROGRAMS[0], "--vehicle", "hummingbird", "--env",
+             "rotorgram/Hover-v0", "--episode-length", "5", "--policy", "geometric")  # fmt: skip
+    assert "lock-step  all 100 steps" in output(capsys, *words)
