@@ -203,7 +203,7 @@ def shown(result: Mapping[str, Row], vehicle: str, tasks: list[str]) -> None:
     import matplotlib.pyplot as plt
     from matplotlib.patches import Patch
 
-    figure, axes = plt.subplots(len(tasks), 1, figsize=(9, 3.2 * len(tasks)), squeeze=False)
+    figure, axes = plt.subplots(len(tasks), 1, figsize=(9, 3.2 * len(tasks) + 0.6), squeeze=False)
     for axis, task in zip(axes[:, 0], tasks, strict=True):
         what = "seconds" if task == "Waypoints" else "error"
         for place, pilot in enumerate(PILOTS):
@@ -213,19 +213,24 @@ def shown(result: Mapping[str, Row], vehicle: str, tasks: list[str]) -> None:
                     continue
                 x = number + (place - (len(PILOTS) - 1) / 2) / (len(PILOTS) + 1)
                 whole = row["survived"] == row["flights"]
-                height = row[what] if whole and (task != "Waypoints" or row["passed"]) else np.nan
+                height = (
+                    row[what]
+                    if whole and (task != "Waypoints" or row["passed"] == row["flights"])
+                    else np.nan
+                )
                 low, high = row[f"{what}_interval"]
                 if np.isnan(height):
                     axis.plot(x, 0.0, "x", color=f"C{place}", clip_on=False)
                     continue
                 axis.bar(x, height, 1 / (len(PILOTS) + 1), color=f"C{place}")
                 axis.vlines(x, low, high, color="0.3", linewidth=1)
+        axis.set_ylim(bottom=0.0)
         axis.set_xticks(range(len(CASES)), list(CASES))
         axis.set_ylabel("time to the last point, s" if what == "seconds" else "rms error, m")
-        axis.set_title(f"{task}-v0 on {vehicle}; x: a flight was lost, or no point is the last")
+        axis.set_title(f"{task}-v0 on {vehicle}; ×: a flight crashed, or points were left")
     handles = [Patch(color=f"C{place}") for place in range(len(PILOTS))]
-    figure.legend(handles, PILOTS, loc="lower center", ncols=len(PILOTS), frameon=False)
-    figure.tight_layout(rect=(0, 0.05, 1, 1))
+    figure.legend(handles, PILOTS, loc="lower center", ncols=4, frameon=False)
+    figure.tight_layout(rect=(0, 0.08, 1, 1))
     figure.savefig("docs/images/pilots.svg", metadata={"Date": None})
 
 

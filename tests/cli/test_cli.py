@@ -93,7 +93,7 @@ def test_a_long_address_is_shortened(capsys: Capsys) -> None:
 
 
 @pytest.mark.parametrize(
-    "arguments", [["train", "dqn"], ["sim", "--speed", "2"], ["fly"], ["compare", "--seeds", "x"]]
+    "arguments", [["train", "dqn"], ["sim", "--speed", "2"], ["soar"], ["compare", "--seeds", "x"]]
 )
 def test_wrong_flags_name_what_was_expected(arguments: list[str], capsys: Capsys) -> None:
     status, out, err = run(capsys, *arguments)
@@ -125,7 +125,7 @@ def test_ctrl_c_while_a_dataclass_is_made_exits_with_130(
 
 def test_no_command_and_an_unknown_one(capsys: Capsys, monkeypatch: pytest.MonkeyPatch) -> None:
     assert run(capsys)[0] == 2
-    status, _, err = run(capsys, "fly")
+    status, _, err = run(capsys, "soar")
     assert status == 2
     assert err.count("\n") == 1
     assert "expected a command of sim, train, " in err
@@ -374,7 +374,7 @@ def test_an_agent_that_is_late(capsys: Capsys) -> None:
     ("words", "sentence"),
     [
         (["--vehicle", "nowhere.xml"], "vehicle: cannot read nowhere.xml: No such file"),
-        (["--control-period", "0.003"], "control_period: expected a positive multiple of the"),
+        (["--control-period", "0.013"], "control_period: expected a positive multiple of the"),
     ],
 )
 def test_an_error_of_our_own_simulator_is_told_once(
