@@ -7,8 +7,8 @@ unexport PYTHONDONTWRITEBYTECODE
 
 .PHONY: install demo test test-other-processor test-wheel test-libraries lint types links docs clean
 
-# What trains, draws, reports and records; Ray and the tools of `make test` are left out.
-install: .venv/.train,record,render,report,fast links
+# What trains, draws, reports, records and speaks MAVLink; Ray and the tools of `make test` are left out.
+install: .venv/.train,record,render,report,fast,autopilot links
 
 # A short comparison: three agents, three seeds, eight drones; a minute and a half on two cores. Too short
 # and too few seeds to decide the paper's claims: docs/results.md has the long one.

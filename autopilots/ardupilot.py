@@ -17,7 +17,7 @@ from ..models.errors import require
 from ..sim.control.gains import Gains
 from .programs import HOST, Program
 from .protocol import ardupilot as protocol
-from .protocol.frames import north_east_down
+from .protocol.frames import ORIGIN, geodetic, north_east_down
 from .reading import Floats, Order, Propellers, Reading
 from .seat import Start
 
@@ -31,15 +31,15 @@ ASK_EVERY: Final = 400
 """Steps between two requests for reports of its estimate, until they say that it is ready."""
 MOVED: Final = 0.05
 """Least distance between the goals of two missions, m."""
+_EARTH: Final = 6_378_100.0
+"""Radius that it takes for the earth's, m: RADIUS_OF_EARTH."""
 _TABLES: Final = tomllib.loads(Path(__file__).with_suffix(".toml").read_text())
 _NEAR: Final = 25.0  # °: between a rotor and the place of its motor
-_LATITUDE, _LONGITUDE = 47.377, 8.542
-_METRE: Final = 89.832  # of latitude, in 1e-7°
 _OPTIONS: Final = (
     "--serial1=none:0",
     "--serial2=none:0",
     "--defaults=vehicle.parm",
-    f"--home={_LATITUDE},{_LONGITUDE},0,0",
+    f"--home={ORIGIN[0]},{ORIGIN[1]},0,0",
     "--speedup=1000",
     "--start-time=1700000000",  # GPS tells it the time
 )
@@ -222,12 +222,9 @@ class ArduPilot:
     def _send_item(self, number: int) -> None:
         """Of a mission to the goal. Its first item, home, has no effect."""
         assert self._origin is not None
-        east, north, up = self._goal.tolist()
-        latitude = round(_LATITUDE * 1e7 + north * _METRE)
-        east_metre = _METRE / math.cos(math.radians(_LATITUDE))
-        longitude = round(_LONGITUDE * 1e7 + east * east_metre)
-        place = (latitude, longitude, up - self._origin[2])
-        fields = (_ABOVE_HOME, _WAYPOINT, 0, 1, 1, 0, 0, 0, *place)
+        latitude, longitude, _ = geodetic(self._goal, _EARTH)
+        height = self._goal[2] - self._origin[2]
+        fields = (_ABOVE_HOME, _WAYPOINT, 0, 1, 1, 0, 0, 0, latitude, longitude, height)
         self._send("mission_item_int", 1, 1, number, *fields)
 
     def _command(self, number: int, *values: int) -> None:

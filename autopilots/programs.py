@@ -70,7 +70,8 @@ class Program:
         if program is None:
             around = [f"{name}={shlex.quote(value)}" for name, value in environment.items()]
             words = " ".join([*around, shlex.join([self.name, *arguments])])
-            print(f"{self.name}: waiting for it; start it so:\ncd {self.folder} && {words}")
+            place = shlex.quote(str(self.folder))
+            print(f"{self.name}: waiting for it; start it so:\ncd {place} && {words}")
             return
         command = [str(program), *arguments]
         if not os.access(program, os.X_OK):

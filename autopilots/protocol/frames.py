@@ -44,13 +44,13 @@ def angles_of(quaternion: Floats) -> list[float]:
     return [math.atan2(left_z, up_z), pitch, math.atan2(front_x, front_y)]
 
 
-def geodetic(position: Floats) -> list[int]:
+def geodetic(position: Floats, radius: float = _RADIUS) -> list[int]:
     """Latitude and longitude, 1e-7 °, and altitude above sea level, mm, of a position in our
-    world, m, shape (3,).
+    world, m, shape (3,), on a sphere of a radius, m.
     """
     east, north, up = position.tolist()
     latitude, longitude, altitude = ORIGIN
-    parallel = _RADIUS * math.cos(math.radians(latitude))
-    latitude += math.degrees(north / _RADIUS)
+    parallel = radius * math.cos(math.radians(latitude))
+    latitude += math.degrees(north / radius)
     longitude += math.degrees(east / parallel)
     return [round(1e7 * latitude), round(1e7 * longitude), round(1e3 * (altitude + up))]

@@ -27,7 +27,6 @@ needs_program = pytest.mark.skipif(
 )
 RATE = 400.0
 PEER = """\
-#!{python}
 import os, socket, struct, sys
 words = dict(word.split("=", 1) for word in sys.argv[1:])
 link = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
@@ -93,7 +92,9 @@ def start_of(program: Path, mode: str = "guided") -> Start:
 def written(folder: Path, behaviour: str) -> Path:
     """A program that does this for each state."""
     program = folder / "peer"
-    program.write_text(PEER.format(python=sys.executable, behaviour=behaviour))
+    script = folder / "peer.py"
+    script.write_text(PEER.format(behaviour=behaviour))
+    program.write_text(f'#!/bin/sh\nexec "{sys.executable}" "{script}" "$@"\n')
     program.chmod(0o755)
     return program
 

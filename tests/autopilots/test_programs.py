@@ -1,6 +1,7 @@
 """Programs of others: their folders, ports, ends."""
 
 import os
+import shlex
 import shutil
 import signal
 import socket
@@ -148,7 +149,7 @@ def test_a_program_of_the_user_is_told_how_and_waited_for(capsys):
     program.start(None, ["-c", ECHO, str(port)], {"SPEED": "1 2"})
     said = capsys.readouterr().out
     assert said.startswith("echo: waiting for it; start it so:\n")
-    command = said.split("\n", 1)[1].replace(" echo ", f" {sys.executable} ")
+    command = said.split("\n", 1)[1].replace(" echo ", f" {shlex.quote(sys.executable)} ")
     with subprocess.Popen(
         ["sh", "-c", f"exec env {command.split('&& ')[1]}"], cwd=program.folder
     ) as own:

@@ -163,6 +163,11 @@ def test_every_fence_says_what_it_is() -> None:
     assert len(PROGRAMS) >= 16
 
 
+FILES = {  # by the name in their first line
+    b.code.splitlines()[0].removeprefix("# "): b.code
+    for b in ALL
+    if b.language == "toml" and re.match(r"# \S+\.toml\n", b.code)
+}
 STUDIES = [b for b in ALL if b.page == "docs/extending.md" and b.language == "toml"]
 
 
@@ -216,7 +221,6 @@ OTHERS = {
     "source": "the shell's; `make install` makes the file",
     "export": "the shell's",
     "git": "the system's",
-    "make": "another project's",
     "mavproxy.py": "a ground station of others; tests/autopilots/test_mavlink_out.py receives",
     "tensorboard": "a dependency's; tests/agents/test_logs.py reads what it reads",
     "gcc": "tests/udp/test_peers.py, tests/agents/test_export.py",
@@ -239,9 +243,12 @@ RUN = {
     ("page", "command"), TYPED, ids=[f"{page}-{i}" for i, (page, _) in enumerate(TYPED)]
 )
 def test_commands_are_ones_that_there_are(
-    page: str, command: list[str], monkeypatch: pytest.MonkeyPatch
+    page: str, command: list[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     monkeypatch.syspath_prepend(EXAMPLES)  # where landing.py is
+    monkeypatch.chdir(tmp_path)
+    for name, content in FILES.items():
+        (tmp_path / name).write_text(content)
     program, *arguments = command
     match program:
         case "rotorgram":

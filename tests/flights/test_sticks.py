@@ -5,14 +5,14 @@ import json
 import socket
 import time
 from collections.abc import Callable, Iterator
-from contextlib import closing, contextmanager
+from contextlib import closing, contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from browser import Browser, browser
-from commands import Capsys, refused, start, wait_until
+from commands import Capsys, refused, start
 from rotorgram.envs.config import EnvConfig
 from rotorgram.envs.vector import LocalVectorEnv
 from rotorgram.flights.recorded import recorded_trajectories
@@ -257,17 +257,12 @@ def test_a_flight_by_hand_is_recorded(tmp_path: Path) -> None:
     host, path = line.split()[1].removeprefix("http://").split("/")
     connection = http.client.HTTPConnection(host, timeout=30)
 
-    def steer() -> bool:
-        try:
+    with closing(connection), suppress(OSError):  # the second episode has ended
+        while True:
             connection.request("POST", f"/{path}", b"[0, 0.2, 0, 0]")
             answer = connection.getresponse()
             assert answer.status == 200
-            return not answer.read()
-        except OSError:  # the second episode has ended
-            return True
-
-    wait_until(steer, process)
-    connection.close()
+            answer.read()
     out, err = process.communicate(timeout=60)
     assert process.returncode == 0, err
     assert out.startswith("episode 0: 1.00 s, truncated, ")

@@ -149,8 +149,14 @@ def test_each_vehicle_has_the_spec_of_its_rotors(files: dict[str, Path]) -> None
 
 def test_a_period_that_does_not_fit_the_files_step(files: dict[str, Path]) -> None:
     gym.make(ELEVATION, vehicle=files["unequal"], control_period=0.005)
-    with pytest.raises(InputError, match=r"^control_period: .* 0.01 s, .* timestep .* got 0.005"):
-        gym.make(ELEVATION, vehicle=files["included"], control_period=0.005)
+    with pytest.raises(InputError, match=r"^control_period: .* 0.01 s, .* timestep .* got 0.015"):
+        gym.make(ELEVATION, vehicle=files["included"], control_period=0.015)
+
+
+def test_a_shorter_period_shortens_the_physics_step(files: dict[str, Path]) -> None:
+    config = EnvConfig(env_id=ELEVATION, vehicle=str(files["included"]), control_period=0.005)
+    assert config.load_vehicle().timestep == 0.005
+    assert Vehicle.load(files["included"]).timestep == 0.01
 
 
 def test_a_policy_flies_another_vehicle_only_if_the_user_names_one(

@@ -42,7 +42,7 @@ class World:
         self.flown: list[list[float]] = []
         self.ends: list[bool] = [False, False]
 
-    def advance(self, actions: Any, resets: Any, seeds: Any, frozen: Any) -> None:
+    def advance(self, actions: Any, resets: Any, seeds: Any, frozen: Any, asks: Any = None) -> None:
         idle = np.zeros(2, bool) if frozen is None else frozen
         begun = np.zeros(2, bool) if resets is None else resets
         assert not (self.done & ~idle & ~begun).any()

@@ -185,6 +185,7 @@ def is_of_session(kind: int, sequence: int) -> bool:
 def encode_step(m: State | Command, layout: Layout) -> bytes:
     """The bytes of a State or a Command, whole. Raises `InputError` as `encode`."""
     time = 0.0
+    arrays: tuple[Array, ...]
     if isinstance(m, State):
         kind = STATE
         record = layout.state
@@ -193,13 +194,18 @@ def encode_step(m: State | Command, layout: Layout) -> bytes:
         arrays = (*m.observations, m.rewards, m.terminated, m.truncated, *m.telemetry)
     else:
         kind = COMMAND
-        has = (m.seeds is not None, m.asks is not None)
-        record = layout.commands[has]
-        counts = [layout.drones * one for one in has]
+        has_seeds = m.seeds is not None
+        has_asks = m.asks is not None
+        record = layout.commands[has_seeds, has_asks]
+        drones = layout.drones
+        counts = drones * has_seeds, drones * has_asks
         pieces = [_COMMAND_HEAD.pack(m.session, m.sequence, *counts)]
-        optional = [array for array in (m.seeds, m.asks) if array is not None]
-        arrays = (m.actions, m.orders, *optional)
-        _check_asks(m.asks, layout)
+        arrays = (m.actions, m.orders)
+        if m.seeds is not None:
+            arrays += (m.seeds,)
+        if m.asks is not None:
+            _check_asks(m.asks, layout)
+            arrays += (m.asks,)
     for slot, array in zip(record.slots, arrays, strict=True):
         if array.shape != slot.shape or array.dtype != slot.dtype:  # numbers are never converted
             raise InputError(
@@ -246,8 +252,10 @@ def _decode_step(
         arrays.append(np.ndarray(slot.shape, slot.dtype, data, slot.at))
     if kind == COMMAND:
         actions, orders, *optional = arrays
-        asks = optional[-1] if has_asks else None
-        _check_asks(asks, layout)
+        asks = None
+        if has_asks:
+            asks = optional[-1]
+            _check_asks(asks, layout)
         return Command(
             session=session,
             sequence=sequence,
@@ -291,9 +299,9 @@ def _check_numbers(data: bytes, time: float, record: Record, layout: Layout) -> 
             raise InputError(f"action: expected a choice 0 to {most}, got {actions[beyond][0]}")
 
 
-def _check_asks(asks: Array | None, layout: Layout) -> None:
+def _check_asks(asks: Array, layout: Layout) -> None:
     """Raises `InputError` for a request of what the spec does not offer."""
-    if asks is not None and (wrong := asks & ~np.uint64(layout.asked_bits)).any():
+    if (wrong := asks & ~np.uint64(layout.asked_bits)).any():
         offered = layout.asked_bits
         raise InputError(f"requests: expected bits of {offered:#x}, got {wrong.max():#x}")
 
