@@ -121,10 +121,7 @@ class Simulator(NotCopied):
         with ExitStack() as failing:  # closes what is open if a later step fails
             self.stepped = stepped = make_stepped(env, num_envs, keywords)
             failing.callback(stepped.close)
-            age = (COMMAND_AGE,) if free_run else ()
-            asks = stepped.spec.asks if allow_events else ()
-            telemetry = (*stepped.spec.telemetry, *age)
-            self.spec = spec = replace(stepped.spec, asks=asks, telemetry=telemetry)
+            self.spec = spec = _offered(stepped.spec, free_run, allow_events)
             insecure = key is not None or (insecure and not spec.asks)
             worlds = stepped.num_envs // len(spec.agents)
             layout = layout_of(spec, worlds)
@@ -305,6 +302,13 @@ class Simulator(NotCopied):
         link.tap = self._journal.tap
         if link.by_text:  # says no Hello
             link.tap(0, link.hello, binary.encode(link.hello))
+
+
+def _offered(spec: EnvSpec, free_run: FreeRun | None, allow_events: bool) -> EnvSpec:
+    """The spec as agents get it."""
+    age = (COMMAND_AGE,) if free_run else ()
+    asks = spec.asks if allow_events else ()
+    return replace(spec, asks=asks, telemetry=(*spec.telemetry, *age))
 
 
 def _check_several(agents: Sequence[Address], *alone: object) -> None:
