@@ -114,8 +114,8 @@ class Program:
         raise self._silent(wait)
 
     def meet(self, read: Callable[[bytes], object]) -> bytes:
-        """The first datagram on `link` that can be read, as `InputError` is not raised. From then
-        on only its sender is heard. Raises as `receive`.
+        """The first datagram on `link` that `read` does not refuse by `InputError`. From then on
+        only its sender is heard. Raises as `receive`.
         """
         deadline = time.monotonic() + ANSWER
         self.link.settimeout(ANSWER if self._process else None)

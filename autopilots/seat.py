@@ -74,10 +74,10 @@ class Tally:
 class Seat:
     """Flies one drone by a program of its own, which begins anew for each episode.
 
-    The craft stands where its episode starts, level, until the program is ready and its rotors
-    carry it: what the program needs to begin is no part of the episode. Then the program steps once
-    in each control step. Throttle u of a rotor asks for the thrust of the vehicle's curve at u, or
-    u² of its largest.
+    The craft stands as its episode starts until the program is ready and its rotors carry it: what
+    the program needs to begin is no part of the episode. Then the program steps once in each
+    control step. Throttle u of a rotor asks for the thrust of the vehicle's curve at u, or u² of
+    its largest.
 
     A program that ends, hangs or sends no number gives no thrust from then on.
 

@@ -67,11 +67,17 @@ class StickPilot:
             spec = pilot.spec
             level = str(spec.options["action"])
             controller = make_controller(level, vehicle, vehicle.timestep, config.effects)
-            seen = env_spec(config).observation
-            if not isinstance(controller, Rates) or not set(spec.observation) <= set(seen):
+            if not isinstance(controller, Rates):
                 raise InputError(
-                    "policy: expected one of the levels rates, attitude, velocity or position "
-                    f"that observes no more than {spec.env_id} at {1.0 / PERIOD:g}, got {level}"
+                    "policy: expected one of the levels rates, attitude, velocity or position, "
+                    f"got {level}"
+                )
+            other = set(spec.observation).difference(env_spec(config).observation)
+            if other:
+                names = ", ".join(f"{one.name} of shape {one.shape}" for one in other)
+                raise InputError(
+                    f"policy: expected one that observes what {config.env_id} shows here, "
+                    f"got {spec.env_id} with {names}"
                 )
             loops = controller
             self._policy = copy.deepcopy(pilot.policy)

@@ -28,7 +28,7 @@ class Evaluate(AgentFlags, MavlinkFlags):
         checkpoint = load_pilot(self.policy)
         command = in_unseen(fitted(self, checkpoint))
         with remote_env(command, num_envs=command.drones) as env:
-            Headline.of(env.env_spec)  # it names what is measured
+            Headline.of(env.env_spec)  # an env without one is refused before it is flown
             policy = policy_for(command, checkpoint, env.env_spec)
             with mavlink_out(self, env.env_spec) as env.observer:
                 trajectories = fly_episodes(env, policy, self.episodes, "final")

@@ -37,7 +37,8 @@ class Fly(EnvFlags, MavlinkFlags):
     connect: bool = False
     """Wait for a program that you start: the command is printed."""
     mode: Annotated[str | None, arg(metavar="MODE")] = None
-    """How it flies: guided or auto; angle or acro; auto, pid, mellinger, indi or brescianini."""
+    """How it flies: guided or auto; angle or acro; auto, pid, mellinger, indi, brescianini or
+    policy."""
     policy: Annotated[str | None, arg(metavar="POLICY")] = None
     """What moves Betaflight's sticks in place of our loops: a checkpoint, the folder of a training,
     or a controller."""

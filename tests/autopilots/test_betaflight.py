@@ -151,7 +151,10 @@ def test_a_command_that_its_cli_refuses() -> None:
 def test_a_policy_of_another_task_is_refused() -> None:
     config = config_of()
     spec = env_spec(config.changed(action="rates", history=2))
-    with pytest.raises(InputError, match="policy: expected one of the levels rates, attitude"):
+    with pytest.raises(
+        InputError,
+        match="policy: expected one that observes what rotorgram/Hover-v0 shows here, got",
+    ):
         next(flown(PROGRAMS[0], config, "acro", Pilot(Asks(0.0), spec)))
 
 
