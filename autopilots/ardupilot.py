@@ -120,6 +120,7 @@ class ArduPilot:
         if "rangefinder" in config.sensors:
             values["RNGFND1_TYPE"] = 100
         self._steps = 0
+        self.order_every = TALK_EVERY
         self._origin: Floats | None = None
         self._optional: dict[str, object] = {}
         if any(config.effects.wind):

@@ -120,7 +120,8 @@ class Running(Program):
     def fly(self, memory: bytes, motors: int) -> None:
         """Start it with a memory, and wait until it has booted."""
         (self.folder / _MEMORY).write_bytes(memory)
-        self.start(self._path, environment={**self._environment, "BETAFLIGHT_LOCKSTEP": "1"})
+        environment = {**self._environment, "BETAFLIGHT_LOCKSTEP": "1"}
+        self.start(self._path, environment=environment, own_clock=not self._environment)
         self.meet(lambda datagram: protocol.throttles(datagram, motors))
 
     def tell(self, datagram: bytes, port: int) -> None:
@@ -132,7 +133,8 @@ class Running(Program):
         self.start(self._path, environment=self._environment)
         try:
             with self._connected() as link:
-                _told(link, "#")
+                _told(link, "#")  # it wants silence behind this, 0.1 s of its clock
+                link.settimeout(0.05)
                 version = protocol.version_of(_told(link, "version"))
                 for command in commands:
                     _told(link, command)
@@ -147,7 +149,7 @@ class Running(Program):
         while True:
             try:
                 return socket.create_connection((HOST, protocol.CLI_PORT + self.apart), 0.5)
-            except ConnectionRefusedError:  # it does not listen yet
+            except (ConnectionRefusedError, TimeoutError):  # it does not listen yet
                 if self._path and time.monotonic() > deadline:
                     raise
                 time.sleep(0.01)
@@ -197,7 +199,7 @@ class Betaflight:
         self._weight = vehicle.mass * vehicle.gravity
         self._propellers = Propellers(config, vehicle)
         self._pilot = StickPilot(config, vehicle, pilot, mode == "acro")
-        self._sticks_every = round(self._pilot.period * protocol.RATE)
+        self.order_every = round(self._pilot.period * protocol.RATE)
         gains = self._pilot.gains
         full = 10.0 * np.clip(np.ceil(np.degrees(gains.most_rate) / 10.0), 1.0, 199.0)
         matches = pilot is not None and pilot.matches
@@ -225,9 +227,8 @@ class Betaflight:
         """As `Stack.step`."""
         self.ready = reading.time >= BOOT
         if order is not None:
-            self._ordered = min(self._ordered, reading.time)
-        if self._steps % self._sticks_every == 0:
             self._move_sticks(reading, order, observation)
+        if self._steps % self.order_every == 0:
             sticks = protocol.sticks_packet(reading.time, self._channels)
             self._program.tell(sticks, protocol.STICKS_PORT)
         self._steps += 1
@@ -238,7 +239,7 @@ class Betaflight:
         received = self._program.receive() if math.isnan(self._due) else self._newest()
         if received is not None:
             self._throttles = protocol.throttles(received, self._rotors)
-        elif order is not None and not order.stands:
+        else:
             self.late += 1
         return self._throttles
 
@@ -259,14 +260,13 @@ class Betaflight:
             return self._program.receive(wait=0.1)
         return newest
 
-    def _move_sticks(self, reading: Reading, order: Order | None, observation: Observation) -> None:
-        if reading.time < self._ordered:
-            return
+    def _move_sticks(self, reading: Reading, order: Order, observation: Observation) -> None:
+        self._ordered = min(self._ordered, reading.time)
         self._channels[_ARM] = 2000.0
         self._channels[_ANGLE] = 1000.0 if self._pilot.acro else 2000.0
         if reading.time < self._ordered + ARMING:
             return
-        if order is not None and order.stands:
+        if order.stands:
             demands = self._pilot.held(self._weight, reading)
         else:
             demands = self._pilot.demands(reading, observation)

@@ -20,7 +20,7 @@ BOOT: Final = 4.0
 """Time until it takes goals, s of its clock: it finds the gyro's bias from 1024 samples at rest."""
 POSE_EVERY: Final = 10
 """Steps between two poses, as motion capture gives them at 100 Hz."""
-GOAL_EVERY: Final = 20
+ORDER_EVERY: Final = 20
 _CORNERS: Final = [[1, -1], [-1, -1], [-1, 1], [1, 1]]
 """Signs of x and y of its motors."""
 _FULL: Final = 65535.0
@@ -94,6 +94,7 @@ class Crazyflie:
             self._parameters.append(packet)
         self._steps = 0
         self._throttles = np.zeros(4)
+        self.order_every = ORDER_EVERY
         self.ready = False
         self.why = "the firmware gives no thrust"
         self.late = 0
@@ -103,7 +104,8 @@ class Crazyflie:
         environment = {"LD_PRELOAD": str(compiled(_SOURCE, self._program.folder))}
         if self._real_time:
             environment["ROTORGRAM_OWN_CLOCK"] = "1"
-        self._program.start(program, [str(protocol.PORT + number), HOST], environment)
+        words = [str(protocol.PORT + number), HOST]
+        self._program.start(program, words, environment, own_clock=self._real_time)
         self._program.meet(protocol.check_greeting)
         self._program.send(protocol.HELLO)
         self._due = self._heard = time.monotonic()
@@ -113,7 +115,7 @@ class Crazyflie:
         self.ready = reading.time >= BOOT
         if self._steps % POSE_EVERY == 0:
             self._program.send(protocol.pose_packet(reading))
-        if order is not None and self._steps % GOAL_EVERY == 0:
+        if order is not None:
             self._program.send(protocol.goal_packet(order))
         elif self.ready and self._parameters:
             self._program.send(self._parameters.pop())
@@ -123,7 +125,7 @@ class Crazyflie:
         self._steps += 1
         self._due = max(self._due + 1.0 / protocol.RATE, time.monotonic())
         answered = self._take_answers()
-        if self._real_time and not answered and order is not None and not order.stands:
+        if self._real_time and not answered:
             self.late += 1
         return self._throttles
 

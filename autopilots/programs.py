@@ -19,6 +19,7 @@ HOST = "127.0.0.1"
 ANSWER = 5.0
 """Longest time for an answer, s."""
 _LOG = "output.txt"
+_CORES = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else []
 
 
 class Program:
@@ -63,9 +64,13 @@ class Program:
         program: Path | str | None,
         arguments: Sequence[str] = (),
         environment: Mapping[str, str] = {},
+        own_clock: bool = False,
     ) -> None:
         """Run it in the folder, its output in a file there. Without a program, say how the user
         starts it, and wait for it.
+
+        One without its own clock runs on one core with this thread: they take turns, and a core
+        that slept would wake late for each turn.
         """
         if program is None:
             around = [f"{name}={shlex.quote(value)}" for name, value in environment.items()]
@@ -78,6 +83,9 @@ class Program:
             raise InputError(f"program: expected one that can be run, got {program}")
         if shutil.which("setpriv"):  # it is killed even if this process is
             command = ["setpriv", "--pdeathsig", "KILL", *command]
+        if _CORES and not own_clock:
+            os.sched_setaffinity(0, {_CORES[os.getpid() % len(_CORES)]})  # it inherits that
+            self._closing.callback(os.sched_setaffinity, 0, _CORES)
         log = self._closing.enter_context((self.folder / _LOG).open("wb"))
         process = subprocess.Popen(
             command,
@@ -105,7 +113,8 @@ class Program:
         Raises `PeerSilent` where none comes, `PeerClosed` if it has ended.
         """
         where = where or self.link
-        where.settimeout(wait)
+        if where.gettimeout() != wait:  # a call of the system
+            where.settimeout(wait)
         with suppress(TimeoutError, ConnectionRefusedError):
             while True:
                 datagram, sender = where.recvfrom(2048)

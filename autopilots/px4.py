@@ -91,6 +91,7 @@ class Px4:
         self._throttles = np.zeros(self._rotors)
         self._time = 0  # of the latest outputs, µs; 0 before the first
         self._steps = 0
+        self.order_every = ORDER_EVERY
         self.ready = False
         self.why = "it does not arm"
         self.late = 0
@@ -125,7 +126,7 @@ class Px4:
     def step(self, reading: Reading, order: Order | None, observation: Observation) -> Floats:
         """As `Stack.step`."""
         self.ready = reading.time >= BOOT
-        if order is not None and self._steps % ORDER_EVERY == 0:
+        if order is not None:
             self._order(order)
         try:
             if self._steps % GPS_EVERY == 0:

@@ -31,11 +31,14 @@ class Stack(Protocol):
     """Why it is not ready, or does not lift."""
     late: int
     """Steps that were not in lock-step: its outputs were not those of the step's reading."""
+    order_every: int
+    """Steps from one order to the next."""
 
     def step(self, reading: Reading, order: Order | None, observation: Observation) -> Floats:
         """Throttle of each rotor, 0 to 1, shape (R,), after one period of the program's clock.
 
-        Without an order its rotors stay off.
+        An order comes with each `order_every`-th step from when it is ready, and with it the
+        observation as a pilot has it. Before the first its rotors stay off.
         """
 
     def close(self) -> None:
@@ -98,8 +101,8 @@ class Seat:
         self._down = vehicle.hover_thrust - vehicle.thrust_low
         self._propellers = Propellers(start.config, vehicle)
         self._stack: Stack | None = None
-        self._time = self.lifted_after = 0.0
-        self._failed = False
+        self.lifted_after = 0.0
+        self.reset()
 
     def __deepcopy__(self, memo: object) -> Self:
         """One for another drone, or another flight."""
@@ -109,6 +112,8 @@ class Seat:
         """End the program: the next observation begins an episode, and a new one."""
         self.close()
         self._time = 0.0
+        self._steps = 0  # of the program
+        self._counts = not self._arguments[1].real_time  # it boots by its own clock
         self._failed = False
 
     def close(self) -> None:
@@ -135,11 +140,12 @@ class Seat:
         stack = self._stack
         if stack is not None:
             reading = self._instruments.reading(seen, self._time)
-            order = self._instruments.order(seen, reading)
+            order = None
+            if self._takes_order(stack):
+                order = self._instruments.order(seen, reading)
+                seen = self._instruments.seen(seen, reading, order)
             try:
-                told = self._instruments.seen(seen, reading, order)
-                throttle = self._step(stack, reading, order, told)
-                return self._propellers.commands(throttle)
+                return self._propellers.commands(self._step(stack, reading, order, seen))
             except (PeerClosed, PeerSilent, InputError) as error:
                 self.tally.faults.append(f"{error}; after {self._time - self.lifted_after:.3f} s")
                 self._failed = True
@@ -155,7 +161,7 @@ class Seat:
         while lift < LIFTED * weight:
             reading = stands._replace(time=self._time)
             order = None
-            if stack.ready:
+            if stack.ready and self._takes_order(stack):
                 order = Order(reading.position, heading_of(reading.quaternion), stands=True)
             lift = self._propellers.lift(self._step(stack, reading, order, observation))
             if self._time > LONGEST_STAND:
@@ -164,6 +170,11 @@ class Seat:
                     f"its clock, got {lift:.3g} of {weight:.3g} N: {stack.why}"
                 )
         self.lifted_after = self._time
+        self._counts = True
+
+    def _takes_order(self, stack: Stack) -> bool:
+        """Whether one is due."""
+        return self._steps % stack.order_every == 0
 
     def _step(
         self, stack: Stack, reading: Reading, order: Order | None, observation: Any
@@ -172,11 +183,12 @@ class Seat:
         late = stack.late
         throttle = stack.step(reading, order, observation)
         self.tally.steps += 1
-        self.tally.late += stack.late - late
-        if not (throttle.min() >= 0.0 and throttle.max() <= 1.0):  # nan is neither
-            got = throttle.tolist()
+        self.tally.late += (stack.late - late) * self._counts
+        got = throttle.tolist()
+        if not all(0.0 <= one <= 1.0 for one in got):  # nan is not
             raise InputError(f"autopilot: expected throttles from 0 to 1, got {got}")
         self._time += self._period
+        self._steps += 1
         return throttle
 
 

@@ -280,9 +280,11 @@ class Machine:
         """Telemetry and terms of the reward, float64, shape (N, n) and (N,), of a step."""
         telemetry = {}
         terms = {}
+        drones = self._world.shape[1]
         for name in self._told.fields:
-            values = self._told.read(name, content, self._worlds).astype(np.float64)
-            flat = values.reshape(self._worlds * values.shape[1], -1)
+            view = self._told.view(name, content, self.memory.blocks)
+            values = view.astype(np.float64, order="C").reshape(self.memory.size * drones, -1)
+            flat = values[: self._worlds * drones]
             if name.startswith(_TERM):
                 terms[name.removeprefix(_TERM)] = flat[:, 0]
             else:

@@ -12,10 +12,9 @@ from functools import cached_property
 from typing import TYPE_CHECKING, Literal, get_args
 
 import numpy as np
-from gymnasium.vector.utils import iterate
 from numpy.typing import NDArray
 
-from ..agents.policies import Array, Policy
+from ..agents.policies import Array, Observation, Policy
 from ..envs.autoreset import AdvancingVectorEnv, worlds_done
 from ..envs.config import EnvConfig
 from ..envs.registry import is_known
@@ -249,18 +248,17 @@ def _fly_batch(
     env.single_action_space.seed(of_drones[0])
     spare = [0] * (env.num_envs - used)
     env.reset(seed=of_drones + spare)
-    nobody = np.zeros(env.num_envs, bool)
     wanted = [array.name for array in env.env_spec.observation if array.name in observations]
     rows = [_row(env, wanted)]
     rewards = []
     actions = []
     lengths = np.zeros(env.num_envs, int)
-    terminated = nobody
+    terminated = np.zeros(env.num_envs, bool)
     lost = env.lost
     done = lost | (np.arange(env.num_envs) >= used)
     while not done.all():
         chosen = _act(env, policies, done)
-        env.advance(chosen, nobody, None, worlds_done(done, drones))
+        env.advance(chosen, frozen=worlds_done(done, drones) if done.any() else None)
         rows.append(_row(env, wanted))
         rewards.append(env.rewards)
         actions.append(chosen)
@@ -308,10 +306,9 @@ def _act(
     """Actions of the drones that fly; 0 for the others."""
     space = env.single_action_space
     actions = np.zeros((env.num_envs, *(space.shape or ())), space.dtype)
-    observations = list(iterate(env.observation_space, env.observations))
     for drone in np.flatnonzero(~done).tolist():
         policy = policies[drone]
-        action = space.sample() if policy is None else policy.act(observations[drone])
+        action = space.sample() if policy is None else policy.act(_seen_by(drone, env.observations))
         if np.shape(action) != space.shape:
             raise InputError(
                 f"{type(policy).__name__.lower()}: expected an action of shape {space.shape}, "
@@ -319,6 +316,14 @@ def _act(
             )
         actions[drone] = action
     return actions
+
+
+def _seen_by(drone: int, observations: Observation) -> Observation:
+    """Its own observation."""
+    if isinstance(observations, Mapping):
+        return {name: values[drone] for name, values in observations.items()}
+    own: Array = observations[drone]
+    return own
 
 
 def flown_trajectories(

@@ -4,6 +4,7 @@ Body axes of ours are x forward, y left, z up. What Betaflight takes for them wa
 it, and differs between releases: see `YAW`.
 """
 
+import math
 import re
 import struct
 from collections.abc import Sequence
@@ -70,8 +71,7 @@ def throttles(datagram: bytes, motors: int) -> NDArray[np.float64]:
     count, *values = _MOTORS.unpack(datagram)
     if count != motors:
         raise InputError(f"betaflight: expected {motors} motors, got {count}")
-    outputs = np.array(values[:motors])
-    if not np.isfinite(outputs).all():
-        raise InputError(f"betaflight: expected finite motors, got {outputs.tolist()}")
-    throttles: NDArray[np.float64] = (outputs / 1000.0 - 1.0).clip(0.0, 1.0)
-    return throttles
+    outputs = values[:motors]
+    if not all(map(math.isfinite, outputs)):
+        raise InputError(f"betaflight: expected finite motors, got {outputs}")
+    return np.array([min(max(output / 1000.0 - 1.0, 0.0), 1.0) for output in outputs])

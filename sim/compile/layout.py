@@ -4,7 +4,6 @@ Worlds lie in blocks of lanes. A block holds row after row: a component of an ar
 """
 
 from collections.abc import Mapping
-from math import prod
 
 import numpy as np
 
@@ -33,11 +32,17 @@ class Layout:
         self.fields = fields
         self.lanes = lanes
         self.offsets: dict[str, int] = {}
+        self._strides: dict[str, tuple[int, ...]] = {}  # of lanes and rows
         self.size = 0
         for name, (dtype, shape) in fields.items():
             self.offsets[name] = self.size
-            bytes_ = prod(shape) * lanes * dtype.itemsize
-            self.size += -(-bytes_ // LINE) * LINE
+            strides: list[int] = []
+            step = dtype.itemsize * lanes
+            for length in reversed(shape):
+                strides.insert(0, step)
+                step *= length
+            self._strides[name] = (dtype.itemsize, *strides)
+            self.size += -(-step // LINE) * LINE
 
     def place(self, name: str, row: int) -> int:
         """Where a row of an array begins, in bytes."""
@@ -46,13 +51,8 @@ class Layout:
     def view(self, name: str, content: np.ndarray, blocks: int) -> np.ndarray:
         """An array within the bytes of some blocks, shape (blocks, lanes, *shape)."""
         dtype, shape = self.fields[name]
-        strides: list[int] = []
-        step = dtype.itemsize * self.lanes
-        for length in reversed(shape):
-            strides.insert(0, step)
-            step *= length
         whole = (blocks, self.lanes, *shape)
-        steps = (self.size, dtype.itemsize, *strides)
+        steps = (self.size, *self._strides[name])
         return np.ndarray(whole, dtype, content, self.offsets[name], steps)
 
     def read(self, name: str, content: np.ndarray, worlds: int) -> np.ndarray:

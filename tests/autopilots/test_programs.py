@@ -16,6 +16,11 @@ from rotorgram.autopilots.programs import HOST, Program
 from rotorgram.models import InputError
 from rotorgram.udp.protocol.errors import PeerClosed, PeerSilent
 
+CORES = """
+import os, socket, sys
+mine = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+mine.sendto(repr(os.sched_getaffinity(0)).encode(), ("127.0.0.1", int(sys.argv[1])))
+"""
 ECHO = """
 import os, socket, sys
 mine = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
@@ -59,6 +64,27 @@ def test_it_runs_in_a_folder_of_its_own_that_goes():
     assert folder == str(program.folder.resolve())
     program.close()
     assert not program.folder.exists()
+    program.close()
+
+
+def test_who_takes_turns_shares_a_core_until_the_end():
+    before = os.sched_getaffinity(0)
+    first, second = started(CORES), started(CORES)
+    for program in first, second:
+        assert program.meet(any_of).decode() == repr(os.sched_getaffinity(0))
+    assert len(os.sched_getaffinity(0)) == 1
+    first.close()
+    second.close()
+    assert os.sched_getaffinity(0) == before
+
+
+def test_one_with_its_own_clock_runs_where_it_likes():
+    before = os.sched_getaffinity(0)
+    program = Program("echo", free_port())
+    words = ["-c", CORES, str(program.link.getsockname()[1])]
+    program.start(sys.executable, words, own_clock=True)
+    assert program.meet(any_of).decode() == repr(before)
+    assert os.sched_getaffinity(0) == before
     program.close()
 
 
