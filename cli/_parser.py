@@ -67,30 +67,30 @@ def _parsed_env(
     given = frozenset(flags)
     env = flags.get("env")
     path = flags.get("config")
-    file = _file_values(path, env) if path else {}
+    file, options = _file_values(path, env) if path else ({}, {})
     env_id = env or file.get("env", DEFAULT_ENV)
     listens = "listen" in given or getattr(kind, "listen", None) is not None
     if listens and ":" not in env_id and not registry.is_known(env_id):
-        return _merged(_run_tyro(_for_tyro(kind), prog, words), given, {}, file)
+        return _merged(_run_tyro(_for_tyro(kind), prog, words), given, file, options)
     env_id = registry.load(env_id)
     task = registry.task_type(env_id)
     names = [name.removeprefix("env.") for name in given if name.startswith("env.")]
-    options = None
+    of_task = None
     if names or "help" in given or "-h" in words:  # tyro imports typeguard for some of them, slowly
-        options = _for_tyro(task.Options)
-    command = _run_tyro(_for_tyro(kind, options), prog, words)
+        of_task = _for_tyro(task.Options)
+    command = _run_tyro(_for_tyro(kind, of_task), prog, words)
     own = {name: getattr(command.options, name) for name in sorted(names)}
     clashing = {name: own.pop(name) for name in names if name in KEYWORDS}
     if clashing:
         own["task"] = clashing
-    command = _merged(command, given, own, file)
+    command = _merged(command, given, file, options | own)
     checked = command.env_config().flat_options()
     chosen = {name: checked.get(name, value) for name, value in command.options.items()}
     return replace(command, options=chosen)
 
 
-def _file_values(path: str, env: str | None) -> Options:
-    """Values of a config's file by the names of fields. Raises `InputError`."""
+def _file_values(path: str, env: str | None) -> tuple[Options, Options]:
+    """Values of a config's file by the names of fields, and options. Raises `InputError`."""
     from ..envs.config import KEYWORDS, BackendConfig, read_keywords
     from ..envs.spec import canonical_id
 
@@ -111,13 +111,12 @@ def _file_values(path: str, env: str | None) -> Options:
         raise InputError(
             f"config: expected no options of {env_id} with --env {env}, got {', '.join(own)}"
         )
-    return {**values, "options": options}
+    return values, options
 
 
-def _merged(command: EnvFlags, given: frozenset[str], own: Options, file: Options) -> EnvFlags:
-    """The command with its options: those of the file, then `own` and the other flags."""
-    added = {name: value for name, value in file.items() if name not in {*given, "options"}}
-    options = {**file.get("options", {}), **own}
+def _merged(command: EnvFlags, given: frozenset[str], file: Options, options: Options) -> EnvFlags:
+    """The command with the values of a file, and options, to which it adds; flags win."""
+    added = {name: value for name, value in file.items() if name not in given}
     for name in given.intersection(_PLAIN_FLAGS):
         options[name] = getattr(command, name)
     for name in given.intersection(_NAMED_FLAGS):

@@ -21,18 +21,16 @@ _LINE_EVERY = 10.0  # s
 @contextmanager
 def bars() -> Iterator["OnProgress"]:
     """A function that shows how far the named run is: (name, done, total, words)."""
-    if not sys.stdout.isatty():
-        yield Lines()
-        return
-    from rich.console import Console
+    if sys.stdout.isatty():
+        from rich.console import Console
 
-    console = Console()
-    if console.is_dumb_terminal:
-        yield Lines()
-        return
-    shown = Bars(console)
-    with shown.progress:
-        yield shown
+        console = Console()
+        if not console.is_dumb_terminal:
+            shown = Bars(console)
+            with shown.progress:
+                yield shown
+            return
+    yield Lines()
 
 
 class Bars:

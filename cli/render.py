@@ -65,6 +65,7 @@ class Render(EnvFlags):
         from ..models.cameras import read_size
         from ..rendering.film import check_film
         from ..rendering.gl import offscreen_context
+        from ..udp.journal.reader import count_of
         from ._progress import bars
 
         width, height = read_size("size", self.size, 16, 8192)
@@ -82,8 +83,7 @@ class Render(EnvFlags):
             raise InputError(f"at: expected 0 to {longest:g} s, the flight's end, got {self.at:g}")
         with bars() as progress:
             frames = film(self.out, tracks, config, partial(progress, self.out.name))
-        pictures = "1 picture" if frames == 1 else f"{frames} pictures"
-        print(f"film: {self.out} ({pictures} of {width}x{height})")
+        print(f"film: {self.out} ({count_of(frames, 'picture')} of {width}x{height})")
 
     def _check(self) -> None:
         """Refuse flags that contradict each other."""

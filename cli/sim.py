@@ -78,7 +78,7 @@ class Sim(WireFlags, MavlinkFlags):
             num_envs=self.num_envs,
             bind=parse_address(self.bind),
             codec=self.codec,
-            config=LinkConfig(timeout=self.timeout, drop=self.drop),
+            config=LinkConfig(**self.settings(LinkConfig)),
             key_file=self.key_file,
             insecure=self.insecure,
             record=self.record,

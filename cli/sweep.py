@@ -69,11 +69,7 @@ def parse_grid(words: Iterable[str]) -> dict[str, Values]:
             raise InputError(f"grid: expected NAME=VALUE,VALUE,…, got {word!r}")
         if name in grid:
             raise InputError(f"grid: expected each name once, got {name} twice")
-        values = _values(text)
-        for place, value in enumerate(values):
-            if value in values[:place]:
-                raise InputError(f"grid: expected each {name} once, got {value!r} twice")
-        grid[name] = values
+        grid[name] = _values(text)
     return grid
 
 

@@ -188,7 +188,7 @@ class Network:
             self.send()
             assert self.now < end, f"not in {most} s"
             timers = [client.next_timer() for client in self.clients.values()]
-            due = min([self.server.next_timer() or inf, *timers])
+            due = min([self.server.next_timer(), *timers])
             if self.flying and self.flying[0][0] <= due:
                 self._arrive()
             else:

@@ -25,9 +25,9 @@ from ..envs.info import Info
 from ..envs.spaces import action_space, joined, observation_space, telemetry_names
 from ..envs.spec import ArraySpec, EnvSpec
 from ..models.errors import InputError, NotCopied
-from ..models.fields import Limits, OrNone, check
+from ..models.fields import Limits, OrNone, check, check_names
 from .protocol.client import Address
-from .protocol.layout import MAX_DRONES, Array
+from .protocol.layout import DRONES, MAX_DRONES, Array
 from .protocol.messages import FLY, FREEZE, MAX_UINT64, RESET
 from .protocol.statistics import Statistics
 from .transport.agent import Agent, AgentConfig, AgentSettings
@@ -259,8 +259,7 @@ class RemoteVectorEnv(_Remote, AdvancingVectorEnv, VectorEnv[Observation, ArrayL
         self.telemetry: Arrays = {}
         self._reasons: Array | None = None  # of simulators that were lost in this step
         self.metadata = {"render_modes": [], "autoreset_mode": checked_mode(autoreset_mode)}
-        limits = Limits(1, MAX_DRONES, whole=True)
-        self.num_simulators: int = check("num_simulators", limits, num_simulators)
+        self.num_simulators: int = check("num_simulators", DRONES, num_simulators)
         drones = None
         if num_envs is not None:
             most = num_simulators * MAX_DRONES
@@ -294,9 +293,7 @@ class RemoteVectorEnv(_Remote, AdvancingVectorEnv, VectorEnv[Observation, ArrayL
             options: `reset_mask`: bool, shape (N,): which drones; the others are frozen.
         """
         options = options or {}
-        for name in options:
-            if name != "reset_mask":
-                raise InputError(f"options: expected reset_mask or none over UDP, got {name!r}")
+        check_names(options, ("reset_mask",), "options")
         in_flight = "reset_mask" in options and self._flying
         if not in_flight:
             self.connect()
@@ -365,13 +362,9 @@ class RemoteVectorEnv(_Remote, AdvancingVectorEnv, VectorEnv[Observation, ArrayL
         asks = self._taken_asks()
         self._flying = False  # until the answers are there
         while pending:
-            orders = self._by_slot((RESET * resets + FREEZE * frozen).astype(np.uint8))
-            rows = self._by_slot(actions)
-            optional = [
-                [None] * len(reasons) if numbers is None else self._by_slot(numbers)
-                for numbers in (seeds, asks)
-            ]
-            parts = list(zip(rows, orders, *optional, strict=True))
+            orders = (RESET * resets + FREEZE * frozen).astype(np.uint8)
+            arrays = map(self._by_slot, (actions, orders, seeds, asks))
+            parts = list(zip(*arrays, strict=True))
             self._agent.exchange({slot: parts[slot] for slot in pending})
             asks = None
             lost = self._agent.lost
@@ -385,8 +378,12 @@ class RemoteVectorEnv(_Remote, AdvancingVectorEnv, VectorEnv[Observation, ArrayL
             frozen = ~resets
         return np.repeat(np.array(reasons, object), self._shape[1])
 
-    def _by_slot(self, array: Array) -> Array:
-        """An array of all drones as rows of each simulator, shape (M, N / M, ...)."""
+    def _by_slot(self, array: Array | None) -> Array:
+        """An array of all drones as rows of each simulator, shape (M, N / M, ...); None for each,
+        where there is none.
+        """
+        if array is None:
+            return np.full(self.num_simulators, None)
         return array.reshape(*self._shape, *array.shape[1:])
 
     def _break_off(self, before: tuple[Arrays, Arrays], reasons: Array) -> None:

@@ -143,32 +143,24 @@ def _connect(env: Remote, process: subprocess.Popen[bytes]) -> None:
                 ) from error
 
 
-_cached: dict[str, tuple[Remote, ExitStack]] = {}
+_cached: dict[tuple[EnvConfig, int | None], Remote] = {}
+_open = ExitStack()
+atexit.register(_open.close)
 
 
 @contextmanager
 def cached_simulator(config: EnvConfig, *, num_envs: int | None = None) -> Iterator[Any]:
     """As `spawn_simulator`, but the simulator stays open for the next use in this process.
 
-    To start one takes as long as a short training. One whose block fails is closed, the others by
-    `close_cached_simulators`, or with the process.
+    To start one takes as long as a short training. All are closed with the process, or if a block
+    fails.
     """
-    key = json.dumps([config.to_dict(), num_envs], sort_keys=True)
+    key = config, num_envs
     if key not in _cached:
-        stack = ExitStack()
-        _cached[key] = stack.enter_context(spawn_simulator(config, num_envs=num_envs)), stack
-    env, stack = _cached[key]
+        _cached[key] = _open.enter_context(spawn_simulator(config, num_envs=num_envs))
     try:
-        yield env
+        yield _cached[key]
     except BaseException:
-        del _cached[key]
-        stack.close()
+        _cached.clear()
+        _open.close()
         raise
-
-
-@atexit.register
-def close_cached_simulators() -> None:
-    """Close what `cached_simulator` left open."""
-    while _cached:
-        _, (_, stack) = _cached.popitem()
-        stack.close()

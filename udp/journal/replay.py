@@ -167,19 +167,22 @@ class Verification(Recording):
                 verdict.close()
 
     @property
+    def same(self) -> int:
+        """States that are the same in every bit, in all sessions."""
+        return sum(session.same for session in self.sessions)
+
+    @property
     def identical(self) -> bool:
         """Whether States were compared, and every bit of every one is the same."""
-        compared = sum(session.same for session in self.sessions)
-        return compared > 0 and all(session.identical for session in self.sessions)
+        return self.same > 0 and all(session.identical for session in self.sessions)
 
     def __str__(self) -> str:
         lines = [line for session in self.sessions for line in session.lines()]
         if not self.complete:
             lines.append(f"note: the file is {self.ending}")
         if self.identical:
-            compared = sum(session.same for session in self.sessions)
             sessions = count_of(len(self.sessions), "session")
-            lines.append(f"identical: {compared} States in {sessions}")
+            lines.append(f"identical: {self.same} States in {sessions}")
         elif all(session.identical for session in self.sessions):
             lines.append("nothing to compare")
         else:

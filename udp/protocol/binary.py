@@ -31,6 +31,9 @@ from .messages import (
     Welcome,
 )
 
+Step = State | Command
+"""The messages of a control step."""
+
 MAGIC = b"\xa7R"  # not UTF-8, so that no text datagram begins with it
 VERSION = 3
 HEADER_SIZE = 24
@@ -85,7 +88,7 @@ def encode(message: Message, layout: Layout | None = None) -> bytes:
 
     Raises `InputError` if an array is not of the layout, or not finite.
     """
-    if isinstance(message, State | Command):
+    if isinstance(message, Step):
         assert layout is not None
         return encode_step(message, layout)
     body = b""
@@ -182,7 +185,7 @@ def is_of_session(kind: int, sequence: int) -> bool:
 # ---- State and Command
 
 
-def encode_step(m: State | Command, layout: Layout) -> bytes:
+def encode_step(m: Step, layout: Layout) -> bytes:
     """The bytes of a State or a Command, whole. Raises `InputError` as `encode`."""
     time = 0.0
     arrays: tuple[Array, ...]
@@ -204,7 +207,6 @@ def encode_step(m: State | Command, layout: Layout) -> bytes:
         if m.seeds is not None:
             arrays += (m.seeds,)
         if m.asks is not None:
-            _check_asks(m.asks, layout)
             arrays += (m.asks,)
     for slot, array in zip(record.slots, arrays, strict=True):
         if array.shape != slot.shape or array.dtype != slot.dtype:  # numbers are never converted
@@ -214,21 +216,17 @@ def encode_step(m: State | Command, layout: Layout) -> bytes:
             )
         pieces += (slot.pad, array.tobytes())
     rest = b"".join(pieces)
-    numbers = record.numbers
-    # NaN and infinity stay in a sum. Huge numbers may overflow, so a second look decides.
-    at = record.slots[0].at - _REST_AT
-    if numbers is None or not isfinite(sum(numbers.unpack_from(rest, at), time)):
-        _check_numbers(bytes(_REST_AT) + rest, time, record, layout)
-    flags = record.flags
-    wrong = rest[flags.start - _REST_AT : flags.stop - _REST_AT].translate(None, record.legal)
-    if wrong:
+    data = _START[kind] + zlib.crc32(rest, _START_CRC[kind]).to_bytes(4, "little") + rest
+    if wrong := data[record.flags].translate(None, record.legal):
         raise _wrong_flags(wrong, record)
-    return _START[kind] + zlib.crc32(rest, _START_CRC[kind]).to_bytes(4, "little") + rest
+    # NaN and infinity stay in a sum. Huge numbers may overflow, so a second look decides.
+    numbers = record.numbers
+    if numbers is None or not isfinite(sum(numbers.unpack_from(data, record.slots[0].at), time)):
+        _check_numbers(data, time, record, layout)
+    return data
 
 
-def _decode_step(
-    kind: int, data: bytes, session: int, sequence: int, layout: Layout
-) -> State | Command:
+def _decode_step(kind: int, data: bytes, session: int, sequence: int, layout: Layout) -> Step:
     time = 0.0
     if kind == STATE:
         record = layout.state
@@ -244,25 +242,20 @@ def _decode_step(
     if wrong := data[record.flags].translate(None, record.legal):
         raise _wrong_flags(wrong, record)
     numbers = record.numbers
-    at = record.slots[0].at
-    if numbers is None or not isfinite(sum(numbers.unpack_from(data, at), time)):
+    if numbers is None or not isfinite(sum(numbers.unpack_from(data, record.slots[0].at), time)):
         _check_numbers(data, time, record, layout)
     arrays = []
     for slot in record.slots:
         arrays.append(np.ndarray(slot.shape, slot.dtype, data, slot.at))
     if kind == COMMAND:
         actions, orders, *optional = arrays
-        asks = None
-        if has_asks:
-            asks = optional[-1]
-            _check_asks(asks, layout)
         return Command(
             session=session,
             sequence=sequence,
             actions=actions,
             orders=orders,
             seeds=optional[0] if has_seeds else None,
-            asks=asks,
+            asks=optional[-1] if has_asks else None,
         )
     first = len(layout.observation)
     return State(
@@ -279,7 +272,9 @@ def _decode_step(
 
 
 def _check_numbers(data: bytes, time: float, record: Record, layout: Layout) -> None:
-    """Raises `InputError` for numbers that are not finite, or a choice that does not exist."""
+    """Raises `InputError` for numbers that are not finite, or a choice or a request that does not
+    exist.
+    """
     if not isfinite(time):
         raise InputError(f"time: expected a finite number, got {time}")
     for slot in record.slots:
@@ -297,13 +292,11 @@ def _check_numbers(data: bytes, time: float, record: Record, layout: Layout) -> 
         if beyond.any():
             most = layout.choices - 1
             raise InputError(f"action: expected a choice 0 to {most}, got {actions[beyond][0]}")
-
-
-def _check_asks(asks: Array, layout: Layout) -> None:
-    """Raises `InputError` for a request of what the spec does not offer."""
-    if (wrong := asks & ~np.uint64(layout.asked_bits)).any():
+    if record.asks is not None:
         offered = layout.asked_bits
-        raise InputError(f"requests: expected bits of {offered:#x}, got {wrong.max():#x}")
+        unknown = record.asks.view(data) & ~np.uint64(offered)
+        if unknown.any():
+            raise InputError(f"requests: expected bits of {offered:#x}, got {unknown.max():#x}")
 
 
 def _wrong_flags(wrong: bytes, record: Record) -> InputError:

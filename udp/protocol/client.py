@@ -312,6 +312,10 @@ class Client:
             if self.by_text:
                 message: Message = text.decode_command(plain, self.layout, self.hello.session)
             else:
+                _, session, _ = binary.check(plain)
+                if session != self.hello.session:
+                    self._drop("foreign", f"session {session:016x}", now)
+                    return None
                 if is_fragment(plain):
                     whole = self._assemble(plain, now)
                     if whole is None:
@@ -320,9 +324,6 @@ class Client:
                 message = binary.decode(plain, self.layout)
         except DecodeError as error:
             self._drop(error.cause, str(error), now)
-            return None
-        if message.session != self.hello.session:
-            self._drop("foreign", f"session {message.session:016x}", now)
             return None
         then = SIMULATOR[self.state].get(("received", type(message)))
         number = getattr(message, "sequence", self.sequence)
@@ -445,17 +446,14 @@ class Client:
 
     def _assemble(self, fragment: bytes, now: float) -> bytes | None:
         """The Command that is waited for, once all its fragments are there."""
-        kind, session, sequence = binary.check(fragment)
-        if session != self.hello.session:
-            self._drop("foreign", f"session {session:016x}", now)
-            return None
+        kind, _, sequence = binary.peek(fragment)
         is_due = self.state == "waiting" and sequence == self.sequence
-        if not is_due or kind != binary.COMMAND | binary.FRAGMENT:
+        if not is_due or kind != binary.COMMAND:
             self.statistics.counters["stale"] += 1
             return None
         whole = self._assembler.take(fragment)
         self._progress(now)
-        if whole is None and (answer := self._assembler.ask(fragment)):
+        if answer := self._assembler.ask(fragment):
             self._round_trips.sent(now)
             self._put(answer)
         return whole

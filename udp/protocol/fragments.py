@@ -160,7 +160,9 @@ class Assembler:
         )
 
     def ask(self, fragment: bytes) -> list[bytes]:
-        """The answer to a fragment whose sender waits for one, in no more bytes than it has."""
+        """The answer to a fragment whose sender waits for one, in no more bytes than it has; none
+        where the message is whole.
+        """
         missing = self.missing() if asks(fragment) else None
         if missing is None:
             return []

@@ -19,6 +19,7 @@ from ...models.fields import Limits, check
 Array = np.ndarray
 
 MAX_DRONES = 1 << 16  # most drones of one simulator
+DRONES = Limits(1, MAX_DRONES, whole=True)
 MAX_MESSAGE = 1 << 24  # largest message in all its fragments, bytes
 STATE_ARRAYS_AT = 40
 COMMAND_ARRAYS_AT = 32
@@ -61,7 +62,10 @@ class Record(NamedTuple):
     flags: slice  # bytes that are flags or orders
     legal: bytes  # values of these bytes
     numbers: struct.Struct | None
-    """Reads the floats from the first array on, for a quick check; None if NumPy is faster."""
+    """Reads the floats from the first array on, for a quick check; None if NumPy is faster, or
+    other numbers are to be checked too."""
+    asks: Slot | None = None
+    """Requests of a Command that has them."""
 
 
 @dataclass(kw_only=True, eq=False)
@@ -92,7 +96,7 @@ class Layout:
 
     def __post_init__(self) -> None:
         drones = self.drones
-        check("drones", Limits(1, MAX_DRONES, whole=True), drones)
+        check("drones", DRONES, drones)
 
         reward = ArrayLayout((), "float64")
         flag = ArrayLayout((), "bool")
@@ -113,8 +117,9 @@ class Layout:
             slots = _slots(COMMAND_ARRAYS_AT, drones, arrays)
             self.actions, orders, *_ = slots
             flags = slice(orders.at, orders.end)
-            floats = _numbers(slots[:1]) if self.action else None
-            self.commands[has] = Record(slots, slots[-1].end, flags, b"\0\1\2", floats)
+            asks = slots[-1] if has[1] else None
+            floats = _numbers(slots[:1]) if self.action and not asks else None
+            self.commands[has] = Record(slots, slots[-1].end, flags, b"\0\1\2", floats, asks)
         size = max(self.state.size, self.commands[True, True].size)
         if size > MAX_MESSAGE:
             raise InputError(

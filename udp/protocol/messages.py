@@ -155,7 +155,7 @@ class Missing:
             raise InputError(f"expected a Hello, State or Command, got type {self.kind}")
         size = len(self.bitmap)
         count = self.count
-        if not size or self.first >= count or self.first + 8 * (size - 1) >= count:
+        if not size or self.first + 8 * (size - 1) >= count:
             raise InputError(f"expected a bitmap of {count} fragments, got {size} bytes")
         if (numbers := self.numbers()) and numbers[-1] >= count:
             raise InputError(f"expected fragments below {count}, got {numbers[-1]}")

@@ -9,6 +9,7 @@ read. Memory for simulators without a slot is bounded.
 from collections import OrderedDict
 from collections.abc import Callable
 from contextlib import suppress
+from math import inf
 from typing import NamedTuple, TypeVar
 
 from . import binary, text
@@ -119,15 +120,14 @@ class Server:
         self._resend_at = now + CLOSE_INTERVAL
         self._deadline = now + CLOSE_LINGER
 
-    def next_timer(self) -> float | None:
-        """When `handle_timer` wants to be called; None if never."""
+    def next_timer(self) -> float:
+        """When `handle_timer` wants to be called; infinite if never."""
         is_closing = self._closed and any(self.slots)
-        return min(self._resend_at, self._deadline) if is_closing else None
+        return min(self._resend_at, self._deadline) if is_closing else inf
 
     def handle_timer(self, now: float) -> None:
         """Repeat what is due: a Close that nobody has answered, until nobody will."""
-        timer = self.next_timer()
-        if timer is None or now < timer:
+        if now < self.next_timer():
             return
         for slot, session in enumerate(self.slots):
             if session and now >= self._deadline:
@@ -302,8 +302,7 @@ class Server:
         if isinstance(message, Close):
             del self.openings[opening.peer, opening.number]
             opening.move("received", Close)
-            goodbye = binary.encode(opening.goodbye(""))
-            self.outbox.put([goodbye], arrival.address, opening.session_key())
+            opening.part("")
             self._drop("refused", message.reason, arrival)
         else:
             self._drop("foreign", type(message).__name__, arrival)
@@ -327,9 +326,8 @@ class Server:
                 del self.openings[address, number]
         layout = self._fit(opening.hello)  # another one may have come since its Hello
         if isinstance(layout, str):
-            reason = one_line(layout, len(plain) - _REASON_AT)
-            close = Close(session=opening.number, sequence=1, reason=reason)
-            self.outbox.put([binary.encode(close)], peer, opening.session_key())
+            opening.sequence = state.sequence
+            opening.part(one_line(layout, len(plain) - _REASON_AT))
             opening.move("sent", Close)
             self._drop("refused", layout, arrival)
             return None

@@ -120,11 +120,11 @@ class Session:
         self.asked_at = self.heard_at = now
         self.reply = reply = Transfer(data, self._largest)
         outbox = self.outbox
-        if reply.count == 1 and self.key is None:  # as `put`
+        if reply.count == 1 and self.key is None:  # as `_put`, faster
             outbox.datagrams.append((data, self.peer))
             outbox.statistics.counters["sent"] += 1
         else:
-            outbox.put(reply.start(), self.peer, self.key)
+            self._put(reply.start())
         if outbox.tap:
             self._record(command, data)
 
@@ -140,9 +140,14 @@ class Session:
         """A Close of this session."""
         return Close(session=self.number, sequence=self.sequence, reason=one_line(reason))
 
+    def part(self, reason: str) -> None:
+        """Send a Close to which no answer is awaited."""
+        goodbye = binary.encode(self.goodbye(reason))
+        self.outbox.put([goodbye], self.peer, self.session_key())
+
     def repeat(self) -> None:
         """Send the last answer again, the same bytes."""
-        self.outbox.put(self.reply.start(), self.peer, self.key, "resent")
+        self._put(self.reply.start(), "resent")
 
     def _answer_again(self) -> None:
         """Answer a State that came again: with Alive, while its Command is not there yet."""
@@ -151,7 +156,7 @@ class Session:
         elif not self.is_text:
             alive = Alive(session=self.number, sequence=self.sequence)
             self.move("sent", Alive)
-            self.outbox.put([binary.encode(alive)], self.peer, self.key)
+            self._put([binary.encode(alive)])
 
     def _record(self, message: Message, data: bytes) -> None:
         """Show a message to the tap."""
@@ -161,7 +166,10 @@ class Session:
     def _send(self, data: bytes) -> None:
         """Send a message, and keep its bytes for a repeated State."""
         self.reply = Transfer(data, self._largest)
-        self.outbox.put(self.reply.start(), self.peer, self.key)
+        self._put(self.reply.start())
+
+    def _put(self, datagrams: list[bytes], count: str = "sent") -> None:
+        self.outbox.put(datagrams, self.peer, self.key, count)
 
     # ---- what is received
 
@@ -219,7 +227,7 @@ class Session:
         if isinstance(message, Alive):
             self.heard_at = now
         elif isinstance(message, Missing) and message.kind == binary.COMMAND:
-            self.outbox.put(self.reply.resend(message), self.peer, self.key, "resent")
+            self._put(self.reply.resend(message), "resent")
         else:
             counters["stale"] += 1
         return None
@@ -237,6 +245,6 @@ class Session:
             return None
         self.heard_at = now
         whole = self._assembler.take(fragment)
-        if whole is None and (answer := self._assembler.ask(fragment)):
+        if answer := self._assembler.ask(fragment):
             self.outbox.put(answer, self.peer, self.session_key())
         return whole

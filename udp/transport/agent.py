@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass, fields
 from functools import cached_property
+from math import inf
 from pathlib import Path
 from typing import TYPE_CHECKING, TypedDict
 
@@ -340,7 +341,7 @@ def _leave(pid: int, server: Server, port: Port, journal: "Journal | None") -> N
         return
     server.close("the agent closed", time.monotonic())
     _flush(server, port)
-    while (timer := server.next_timer()) is not None:
+    while (timer := server.next_timer()) < inf:
         left = max(timer - time.monotonic(), 0.0)
         with suppress(OSError):  # nothing came
             datagram, address = port.receive(left)

@@ -115,8 +115,9 @@ class Simulator(NotCopied):
         check("codec", Choice(("binary", "text")), codec)
         check("patience", Limits(0, unit="s", above=True), patience)
         by_text = codec == "text"
-        if agents is not None:
-            _check_several(agents, by_text, record, num_envs)
+        alone = by_text or record or num_envs
+        if agents is not None and alone:
+            raise InputError("agents: expected neither text, record nor num_envs with several")
         key = Key(read_key(key_file), "simulator") if key_file else None
         with ExitStack() as failing:  # closes what is open if a later step fails
             self.stepped = stepped = make_stepped(env, num_envs, keywords)
@@ -311,14 +312,6 @@ def _offered(spec: EnvSpec, free_run: FreeRun | None, allow_events: bool) -> Env
     return replace(spec, asks=asks, telemetry=(*spec.telemetry, *age))
 
 
-def _check_several(agents: Sequence[Address], *alone: object) -> None:
-    """Raises `InputError` for no agent, and for what several of them cannot have."""
-    if not agents:
-        raise InputError("agents: expected one address or more, got none")
-    if any(alone):
-        raise InputError("agents: expected neither text, record nor num_envs with several")
-
-
 def _free_running(
     stepped: Steppable, layout: Layout, links: list[AgentLink], run: FreeRun
 ) -> FreeRunning:
@@ -351,6 +344,8 @@ def _links(
 ) -> list[AgentLink]:
     """A client for each agent, with a session of its own. They share the drones evenly."""
     way_out = TEXT_WAY_OUT if by_text else WAY_OUT
+    if not servers:
+        raise InputError("agents: expected one address or more, got none")
     drones = worlds * len(spec.agents)
     share, left = divmod(drones, len(servers))
     if left:

@@ -12,8 +12,8 @@ from ...envs.config import EnvConfig
 from ...envs.spaces import action_space, observation_space
 from ...envs.spec import ArraySpec, Discrete, EnvSpec, canonical_id, component_names
 from ...models import InputError
-from ...models.fields import Limits, check
-from ..protocol.layout import MAX_DRONES, Array
+from ...models.fields import check
+from ..protocol.layout import DRONES, Array
 from ..protocol.party import Mask, Seeds, World
 
 GymEnv = gym.Env[Any, Any]
@@ -48,8 +48,7 @@ def make_stepped(
         return GymnasiumWorld(env, {})
     env = EnvConfig.from_keywords(env, **keywords)
     drones = env.drones
-    whole = Limits(1, MAX_DRONES, whole=True)
-    count = check("num_envs", whole, drones if num_envs is None else num_envs)
+    count = check("num_envs", DRONES, drones if num_envs is None else num_envs)
     if count % drones:
         raise InputError(f"drones: expected a divisor of num_envs = {count}, got {drones}")
     if registry.is_known(env.env_id):
