@@ -13,6 +13,7 @@ from ..agents.policies import Observation
 from ..envs.config import EnvConfig
 from ..envs.spec import EnvSpec
 from ..models import InputError, Vehicle
+from ..sim.control import RotorThrust
 from ..udp.protocol.errors import PeerClosed, PeerSilent
 from .reading import Floats, Instruments, Order, Propellers, Reading, exact, heading_of
 
@@ -97,8 +98,7 @@ class Seat:
         self._instruments = Instruments(spec)
         self._vehicle = vehicle = start.vehicle
         self._period = spec.control_period
-        self._up = vehicle.thrust_high - vehicle.hover_thrust
-        self._down = vehicle.hover_thrust - vehicle.thrust_low
+        self._rotors = RotorThrust(vehicle)
         self._propellers = Propellers(start.config, vehicle)
         self._stack: Stack | None = None
         self.lifted_after = 0.0
@@ -129,9 +129,7 @@ class Seat:
             _, start, make, _ = self._arguments
             self._stack = make(start)
             self._stand(seen)
-        thrust = self._thrust(seen)
-        over = thrust - self._vehicle.hover_thrust
-        action = np.where(over > 0.0, over / self._up, over / self._down)
+        action = self._rotors.action(self._thrust(seen))
         flown: Floats = action.astype(np.float32)
         return flown
 

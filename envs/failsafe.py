@@ -65,7 +65,7 @@ class Failsafe:
         if isinstance(controller, CollectiveThrust):
             return controller.action(collective, state)
         assert isinstance(controller, Rates)
-        asked = [controller.share(collective), *rates]
+        asked = [controller.collective.share(collective), *rates]
         if isinstance(controller, Velocity):
             gain = controller.gains.position if isinstance(controller, Position) else 1.0
             still = 0.0 * collective

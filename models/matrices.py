@@ -33,6 +33,11 @@ def cross(a: Sequence[Array], b: Sequence[Array]) -> Triple:
     return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
 
 
+def times(rows: Sequence[Sequence[Array]], vector: Sequence[Array]) -> Triple:
+    """A matrix of three rows, and a vector."""
+    return dot(rows[0], vector), dot(rows[1], vector), dot(rows[2], vector)
+
+
 def rotation(
     quaternion: Sequence[Array], twice: float | Array = 2.0
 ) -> tuple[Triple, Triple, Triple]:

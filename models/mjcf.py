@@ -60,8 +60,13 @@ def add_ground(spec: MjSpec) -> None:
     ground = MjSpec()  # of its own: the defaults of the vehicle's file are not the ground's
     plane = mjtGeom.mjGEOM_PLANE
     ground.worldbody.add_geom(name="ground", type=plane, size=(0.0, 0.0, 0.5))
-    ground.visual, ground.stat = spec.visual, spec.stat  # MuJoCo warns if they differ
-    spec.attach(ground, prefix="rotorgram/", frame=spec.worldbody.add_frame())
+    attach(spec, ground, "rotorgram/")
+
+
+def attach(spec: MjSpec, own: MjSpec, prefix: str) -> None:
+    """Add all of a spec, which keeps its own defaults, to another one, with a prefix of names."""
+    own.visual, own.stat = spec.visual, spec.stat  # MuJoCo warns if they differ
+    spec.attach(own, prefix=prefix, frame=spec.worldbody.add_frame())
 
 
 def delete_obstacles(spec: MjSpec) -> None:

@@ -24,6 +24,7 @@ class AislesOptions(SceneOptions):
 
     size: Size = (12.0, 7.2)
     """Of the hall."""
+    room = 0.0
 
     @property
     def counts(self) -> tuple[int, int]:
@@ -36,11 +37,6 @@ class AislesOptions(SceneOptions):
         """As `SceneOptions.most`."""
         rows, count = self.counts
         return 2 * rows * count + rows + 8
-
-    @property
-    def room(self) -> float:
-        """As `SceneOptions.room`."""
-        return 0.0
 
 
 def aisles(hall: "Draft") -> None:

@@ -5,7 +5,7 @@ from pathlib import Path
 from mujoco import MjModel, MjSpec
 
 from ..models import QUAD_XML
-from ..models.mjcf import delete_obstacles, has_ground, read_spec
+from ..models.mjcf import attach, delete_obstacles, has_ground, read_spec
 from . import AIRPORT_XML, SCENE_XML
 from .config import SceneConfig, parse_scene
 from .geoms import add_geoms, add_hulls
@@ -89,7 +89,6 @@ def _add_plain(spec: MjSpec) -> None:
     scene = MjSpec.from_file(str(SCENE_XML))
     if has_ground(spec):
         scene.delete(scene.geom("floor"))
-        scene.visual, scene.stat = spec.visual, spec.stat  # MuJoCo warns if they differ
     else:
         spec.visual = scene.visual
         spec.stat = scene.stat
@@ -97,7 +96,7 @@ def _add_plain(spec: MjSpec) -> None:
         scene.delete(scene.texture("sky"))
     if spec.worldbody.lights:
         scene.delete(scene.light("sun"))
-    spec.attach(scene, prefix=SCENE_PREFIX, frame=spec.worldbody.add_frame())
+    attach(spec, scene, SCENE_PREFIX)
 
 
 def _add_airport(spec: MjSpec) -> None:
@@ -112,8 +111,7 @@ def _add_airport(spec: MjSpec) -> None:
     visual.map.haze = _HAZE
     visual.rgba.haze = _HAZE_COLOUR
     visual.quality.shadowsize = min(visual.quality.shadowsize, _SHADOW_PIXELS)
-    airport = MjSpec.from_file(str(AIRPORT_XML))
-    spec.attach(airport, prefix="airport/", frame=spec.worldbody.add_frame())
+    attach(spec, MjSpec.from_file(str(AIRPORT_XML)), "airport/")
 
 
 def _clear(spec: MjSpec, far: float, slices: int) -> None:

@@ -87,12 +87,15 @@ def least_of(grid: Array | None) -> float:
     return 0.0 if grid is None else float(grid.min())
 
 
+Table = tuple[tuple[float, ...], ...]
+
+
 class Rows:
     """Rule of rows of numbers, m: heights of a field, vertices of a hull."""
 
     expected = f"2 or more rows of as many numbers from -1000 to 1000 m, {MAX_POINTS} at most"
 
-    def read(self, value: object) -> tuple[tuple[float, ...], ...]:
+    def read(self, value: object) -> Table:
         """As `fields.Rule`."""
         if isinstance(value, tuple) and not value:
             return ()

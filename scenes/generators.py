@@ -91,7 +91,7 @@ class Draft:
         return np.array(self.openings).reshape(-1, 6)
 
     def uniform(self, low: float, high: float) -> float:
-        return float(self.rng.uniform(low, high))
+        return self.rng.uniform(low, high)
 
     def choose(self, name: str) -> str:
         """One of the materials of several colours."""

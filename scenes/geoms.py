@@ -7,7 +7,7 @@ import numpy as np
 from mujoco import MjModel, MjsGeom, MjSpec, mjtGeom
 from numpy.typing import ArrayLike, NDArray
 
-from ..models.mjcf import add_ground
+from ..models.mjcf import add_ground, attach
 from . import kernels
 from .fields import least_of
 from .obstacles import hulls_of
@@ -31,8 +31,7 @@ def add_solids(spec: MjSpec, solids: Solids, count: int, content: str) -> None:
     own = MjSpec()  # its defaults are not the spec's
     add_geoms(own, solids, [f"{number}" for number in range(count)], {})
     add_hulls(own, content, {})
-    own.visual, own.stat = spec.visual, spec.stat  # MuJoCo warns if they differ
-    spec.attach(own, prefix=NAME, frame=spec.worldbody.add_frame())
+    attach(spec, own, NAME)
 
 
 def add_geoms(

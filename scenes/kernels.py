@@ -19,7 +19,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..models.matrices import cross, dot
+from ..models.matrices import cross, dot, times
 
 KINDS = ("sphere", "capsule", "cylinder", "box", "plane", "hfield")
 """Capsule and cylinder stand along their third axis. That of a plane is its normal: what lies
@@ -264,13 +264,9 @@ def _minus(a: Vector, b: Vector) -> Vector:
     return a[0] - b[0], a[1] - b[1], a[2] - b[2]
 
 
-def _along(vector: Vector, u: Vector, v: Vector, axis: Vector) -> Vector:
-    return dot(vector, u), dot(vector, v), dot(vector, axis)
-
-
 def _turned(m: Array, vector: Vector) -> Vector:
     """A vector of the world in the frame of a sensor, by the columns of its attitude."""
-    return _along(vector, (m[0], m[3], m[6]), (m[1], m[4], m[7]), (m[2], m[5], m[8]))
+    return times(((m[0], m[3], m[6]), (m[1], m[4], m[7]), (m[2], m[5], m[8])), vector)
 
 
 def _seen(table: Array, j: Array, place: Array, attitude: Array) -> Array:
@@ -281,7 +277,7 @@ def _seen(table: Array, j: Array, place: Array, attitude: Array) -> Array:
     u = _turned(attitude, _three(table, _U, j))
     v = _turned(attitude, _three(table, _V, j))
     axis = _turned(attitude, _three(table, _AXIS, j))
-    middle = _along(center, u, v, axis)
+    middle = times((u, v, axis), center)
     a, b, c = _three(table, _SIZE, j)
     return center, u, v, axis, middle, (a, b, c, c - table[_ROUNDING, j])
 
@@ -289,7 +285,7 @@ def _seen(table: Array, j: Array, place: Array, attitude: Array) -> Array:
 def _local(table: Array, j: Array, point: Vector) -> Vector:
     """A point from the center of a primitive, along its axes."""
     away = _minus(point, _three(table, _CENTER, j))
-    return _along(away, _three(table, _U, j), _three(table, _V, j), _three(table, _AXIS, j))
+    return times((_three(table, _U, j), _three(table, _V, j), _three(table, _AXIS, j)), away)
 
 
 def _gap(kind: Array, table: Array, j: Array, point: Vector, radius: Array) -> Array:
@@ -567,9 +563,9 @@ def _hide(table: Array, place: Array, m: Array, planes: Array, bounds: Array, fa
     """Set `far` to a large number where a primitive lies behind one of six planes of a sensor, by
     its place and the rows of its attitude. `bounds` become the planes with normals in the world.
     """
-    x_row, y_row, z_row = m[:3], m[3:6], m[6:]
+    rows = (m[:3], m[3:6], m[6:])
     for f in range(6):
-        bounds[f, 0], bounds[f, 1], bounds[f, 2] = _along(planes[f], x_row, y_row, z_row)
+        bounds[f, 0], bounds[f, 1], bounds[f, 2] = times(rows, planes[f])
     for j in range(far.size):
         center = _minus(_three(table, _CENTER, j), place)
         u, v, axis = _three(table, _U, j), _three(table, _V, j), _three(table, _AXIS, j)

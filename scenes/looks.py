@@ -9,6 +9,7 @@ import numpy as np
 from mujoco import MjSpec, mjtGeom
 from numpy.typing import ArrayLike as Vector
 
+from ..models.mjcf import attach
 from . import HALL_XML
 from .config import SceneConfig
 from .generators import drafted
@@ -37,8 +38,7 @@ def add_parts(spec: MjSpec, scene: SceneConfig) -> None:
         painter.sun()
     painter.paint()
     if scene.name == "warehouse":
-        walls = MjSpec.from_file(str(HALL_XML))
-        spec.attach(walls, prefix="warehouse/", frame=spec.worldbody.add_frame())
+        attach(spec, MjSpec.from_file(str(HALL_XML)), "warehouse/")
     draft = drafted(scene, scene.seed)
     solids = Solids.drawn([draft])
     geoms = iter(add_geoms(spec, solids, solids.names, PICTURED))
@@ -58,9 +58,7 @@ class Painter:
         self.scene = scene.name
         self.materials = scene.type.materials
         self.rng = np.random.Generator(np.random.PCG64((scene.seed, 1)))  # none of its parts
-
-    def uniform(self, low: float, high: float) -> float:
-        return float(self.rng.uniform(low, high))
+        self.uniform = self.rng.uniform
 
     def colour(self, base: Vector, by: float = 0.06) -> np.ndarray:
         """A colour near `base`."""

@@ -21,7 +21,7 @@ from ..models.fields import (
     read_table,
 )
 from ..models.files import MAX_BYTES, parse_toml
-from .fields import Rows
+from .fields import Rows, Table
 from .kernels import KINDS
 from .registry import MAX_SOLIDS
 
@@ -46,10 +46,10 @@ class Obstacle:
     """As MuJoCo has them: radius; radius and half the length, without the round ends of a capsule;
     half the sides of a box along x, y and z; those of a height field along x and y, and its depth
     below its position. A plane has no end and no size: its z axis points out of it."""
-    heights: Annotated[tuple[tuple[float, ...], ...], Rows()] = ()
+    heights: Annotated[Table, Rows()] = ()
     """Of a height field above its position, m: rows from the least y on, each from the least x
     on."""
-    vertices: Annotated[tuple[tuple[float, ...], ...], Rows()] = ()
+    vertices: Annotated[Table, Rows()] = ()
     """Of a hull: x, y and z of each, from its position, m."""
     position: Annotated[tuple[float, ...], Limits(-1e4, 1e4, "m", count=3)] = (0.0, 0.0, 0.0)
     """Of its center; of a height field of the middle of its ground."""

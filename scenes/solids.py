@@ -18,13 +18,12 @@ from ..models.fields import Limits, check
 from ..models.matrices import settled
 from . import HALL_XML, kernels
 from .config import SceneConfig, parse_scene, refuse_hidden
-from .fields import centered, check_points
+from .fields import Table, centered, check_points
 from .generators import Draft, drafted
 from .motion import REST, offsets
 from .obstacles import HULL, OWN, SIZES, Obstacle, hulls_of, obstacles_of
 
 Array = NDArray[np.float64]
-Rows = tuple[tuple[float, ...], ...]
 
 MAX_CELLS = 1 << 26
 """Most cells of a grid, which takes 0.5 GB then."""
@@ -416,7 +415,7 @@ def obstacle_of(model: MjModel, data: MjData, geom: int) -> Obstacle:
     size = model.geom_size[geom]
     place = data.geom_xpos[geom]
     axes = data.geom_xmat[geom].reshape(3, 3)
-    heights: Rows = ()
+    heights: Table = ()
     if type_ == mjtGeom.mjGEOM_PLANE:
         touches = model.geom_contype[geom] or model.geom_conaffinity[geom]
         is_level = is_ground(model, geom) and size[:2].min() > _MARK
@@ -454,7 +453,7 @@ def obstacle_of(model: MjModel, data: MjData, geom: int) -> Obstacle:
         raise InputError(f"scene: {name}: {error}") from None
 
 
-def _heights(model: MjModel, number: int, name: str) -> Rows:
+def _heights(model: MjModel, number: int, name: str) -> Table:
     """Of a height field, m, to the hundredth of a millimetre."""
     rows, columns = model.hfield_nrow[number], model.hfield_ncol[number]
     check_points(rows, columns, f"scene: {name}")

@@ -18,15 +18,8 @@ _THROW_EVERY = 1.0  # s
 class TrafficOptions(SceneOptions):
     """Of the scene `traffic`."""
 
-    @property
-    def most(self) -> int:
-        """Balls, posts and the ground."""
-        return _BALLS + _POSTS + 1
-
-    @property
-    def room(self) -> float:
-        """As `SceneOptions.room`."""
-        return 0.0
+    most = _BALLS + _POSTS + 1  # and the ground
+    room = 0.0
 
 
 def traffic(field: "Draft") -> None:

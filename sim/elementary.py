@@ -30,15 +30,22 @@ _LAYOUTS = {"float32": (np.int32, 23, 127), "float64": (np.int64, 52, 1023)}
 
 def _precision(sines: int, powers: int, logs: int, **constants: Any) -> SimpleNamespace:
     """Constants of a precision, and series of so many terms, the highest power first."""
-    odd = [(-1) ** n / factorial(2 * n + 1) for n in range(1, sines)]
-    even = [(-1) ** n / factorial(2 * n) for n in range(2, sines + 1)]
+    cosine, sine = wave_series(sines + 1)
     return SimpleNamespace(
-        sine=odd[::-1],
-        cosine=even[::-1],
+        sine=sine[1:-1],  # without the first terms, x of the sine, 1 - x² / 2 of the cosine
+        cosine=cosine[:-2],
         exponential=[1.0 / factorial(n) for n in range(2, powers)][::-1],
         logarithm=[2.0 / (2 * n + 1) for n in range(1, logs)][::-1],
         **constants,
     )
+
+
+def wave_series(count: int) -> tuple[list[float], list[float]]:
+    """So many terms of cos(x) and of sin(x) / x in x², the highest power first."""
+    terms = range(count)[::-1]
+    cosine = [(-1) ** n / factorial(2 * n) for n in terms]
+    sine = [(-1) ** n / factorial(2 * n + 1) for n in terms]
+    return cosine, sine
 
 
 _TABLES = read_own_toml(__file__, "elementary")

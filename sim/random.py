@@ -177,13 +177,12 @@ class Draw:
 
     def normal(self, scale: float, size: tuple[int, ...] = ()) -> Array:
         """Normal numbers, mean 0, standard deviation `scale`, shape (W, A, *size)."""
-        count = self._random.drones * prod(size)
-        drawn = scale * normal(self._next(size, count % 2))[:, :count]
-        return self._spread(drawn, size)
+        return self._spread(scale * normal(self._next(size)), size)
 
-    def _next(self, size: tuple[int, ...], more: int = 0) -> Words:
-        """The next words of each world that begins, from a new block on."""
-        count = self._random.drones * prod(size) + more
+    def _next(self, size: tuple[int, ...]) -> Words:
+        """The next words of each world that begins, from a new block on: an even number."""
+        count = self._random.drones * prod(size)
+        count += count % 2
         step = 0 * self._episode
         words = words_of(self._key, self._use, self._episode, step, count, self._first)
         self._first += -(-count // 4)
@@ -192,7 +191,8 @@ class Draw:
     def _spread(self, drawn: Numbers, size: tuple[int, ...]) -> Array:
         random = self._random
         numbers = np.zeros_like(drawn, shape=(len(random.keys), random.drones, *size))
-        numbers[self._ids] = drawn.reshape(-1, random.drones, *size)
+        count = random.drones * prod(size)
+        numbers[self._ids] = drawn[:, :count].reshape(-1, random.drones, *size)
         return numbers
 
 

@@ -6,7 +6,7 @@ take arrays with the components on their last axis, and any leading axes.
 
 from collections.abc import Sequence
 
-from ..models.matrices import cross, dot, rotation
+from ..models.matrices import cross, rotation
 from .elementary import atan2, cos, sin
 from .state import Array, parts_of, square_root, stack
 
@@ -18,11 +18,6 @@ Rows = tuple[Parts, Parts, Parts]
 
 def add(a: Parts, b: Parts) -> Parts:
     return a[0] + b[0], a[1] + b[1], a[2] + b[2]
-
-
-def times(rows: Sequence[Parts], vector: Parts) -> Parts:
-    """A matrix of three rows, and a vector."""
-    return dot(rows[0], vector), dot(rows[1], vector), dot(rows[2], vector)
 
 
 def transposed(rows: Rows) -> Rows:

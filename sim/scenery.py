@@ -190,11 +190,10 @@ class Scenery(Kept):
             return np.zeros_like(near[..., 0]) + np.float32(FAR)
         if due is not None:
             near = _held(near)
+        mask = near[..., 0] == near[..., 0] if due is None else due
         if is_traced(near):
-            mask = near[..., 0] == near[..., 0] if due is None else due
             return self._called("nearest", mask, stack([*parts_of(near), left, radius]))
-        found = np.zeros(near.shape[:-1], np.float32)
-        mask = np.ones(found.shape, bool) if due is None else due
+        found = np.zeros(mask.shape, np.float32)
         code = kernels.compiled()
         run = code.gaps if code else kernels.gaps_by_numpy
         points = np.ascontiguousarray(near)

@@ -217,6 +217,9 @@ class World(Kept, NotCopied):
         for name, change in changes.items():
             limits = PARAMETERS.get(name, CHANGE)
             parameters[name] = clip(parameters[name] + change, limits.low, limits.high)
+        self._fly_with(parameters)
+
+    def _fly_with(self, parameters: ByName) -> None:
         self.parameters = parameters
         self.effects.take(parameters)
         self._vary(parameters)
@@ -257,9 +260,7 @@ class World(Kept, NotCopied):
         arrays = {name: array.copy() for name, array in arrays.items()}
         super().restore(arrays)
         self.drawn = part_of(arrays, "parameters")
-        self.parameters = {**self.drawn}
-        self.effects.take(self.parameters)
-        self._vary(self.parameters)
+        self._fly_with({**self.drawn})
         state = part_of(arrays, "state")
         for name in self.of_state:
             setattr(self.state, name, state.get(name))

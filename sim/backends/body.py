@@ -10,9 +10,7 @@ Frames: world, z up, and the body's. Position and velocity are those of the body
 
 import math
 from collections.abc import Callable, Mapping
-from functools import cache
-from math import factorial
-from typing import Any, Final, NamedTuple
+from typing import Final, NamedTuple
 
 import numpy as np
 
@@ -32,6 +30,8 @@ mass, body frame, rad/s²; the force at the body's origin over the mass, world f
 _NOTHING = 1e-12  # of the largest number of its kind: what rounding leaves
 _ZERO: Final[Vector] = (0.0, 0.0, 0.0)
 _FURTHEST = (4 * math.pi) ** 2
+_SINGLE, _DOUBLE = elementary.wave_series(8), elementary.wave_series(13)
+"""Up to π / 2 the next terms are below the rounding of float32, and of float64."""
 _BORTZ = (
     2.0742872904159143e-11,
     3.3571419266571038e-09,
@@ -316,17 +316,6 @@ def _to_world(quaternion: Array, vector: Vector) -> Vector:
     return (x * z + w * y) * twice, (y * z - w * x) * twice, up - (x * x + y * y) * twice
 
 
-@cache
-def _series(dtype: np.dtype[Any]) -> tuple[list[float], list[float]]:
-    """Taylor's series of cos(x) and sin(x) / x in x²: up to x = π / 2 the next terms are below the
-    rounding.
-    """
-    terms = range(8 if dtype == np.float32 else 13)[::-1]
-    cosine = [(-1) ** n / factorial(2 * n) for n in terms]
-    sine = [(-1) ** n / factorial(2 * n + 1) for n in terms]
-    return cosine, sine
-
-
 def _rotated(quaternion: Array, rates: Vector, time: float) -> tuple[Array, Array]:
     """A quaternion turned for a time at body rates, and the square of the angle.
 
@@ -335,7 +324,8 @@ def _rotated(quaternion: Array, rates: Vector, time: float) -> tuple[Array, Arra
     x, y, z = rates
     square = (x * x + y * y + z * z) * (time * time)
     of_part = np.minimum(square, _FURTHEST) / 64
-    cosine, sine = (elementary.polynomial(of_part, one) for one in _series(square.dtype))
+    series = _SINGLE if square.dtype == np.float32 else _DOUBLE
+    cosine, sine = (elementary.polynomial(of_part, one) for one in series)
     for _ in range(2):  # the sine is that over the angle
         cosine, sine = 1.0 - 2.0 * of_part * (sine * sine), sine * cosine
         of_part = 4.0 * of_part

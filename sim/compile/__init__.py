@@ -6,7 +6,7 @@ have the bits that NumPy gives: the operations are the same, in the same order, 
 with another.
 """
 
-from .program import Program, Value
+from .program import Program
 from .tracer import TracedArray, Untraceable, lift, once, read
 
-__all__ = ["Program", "TracedArray", "Untraceable", "Value", "lift", "once", "read"]
+__all__ = ["Program", "TracedArray", "Untraceable", "lift", "once", "read"]

@@ -13,7 +13,7 @@ from ... import models
 from ...models.errors import InputError, shortened
 from ..effects import NO_EFFECTS, EffectOptions
 from ..state import Array, WorldState, clip, stack, total
-from .cascade import Attitude, Numbers, Position, Rates, Velocity, share_of
+from .cascade import AroundHover, Attitude, Numbers, Position, Rates, Velocity
 from .gains import Gains, shared_ranges
 
 _CASCADE: Final[dict[str, type[Rates]]] = {
@@ -105,19 +105,16 @@ class RotorThrust:
         self.low = (-1.0,) * vehicle.num_rotors
         self.high = (1.0,) * vehicle.num_rotors
         self.components = tuple(f"F{i + 1}" for i in range(vehicle.num_rotors))
-        self._hover = vehicle.hover_thrust
-        self._up = vehicle.thrust_high - vehicle.hover_thrust
-        self._down = vehicle.hover_thrust - vehicle.thrust_low
+        low, high = vehicle.thrust_low, vehicle.thrust_high
+        self._rotors = AroundHover(low, vehicle.hover_thrust, high)
 
     def thrust(self, action: Array, state: WorldState) -> Array:
         """As `Controller.thrust`."""
-        above = clip(action, 0.0, 1.0)
-        below = clip(action, -1.0, 0.0)
-        return self._hover + self._up * above + self._down * below
+        return self._rotors.thrust(action)
 
     def action(self, thrust: Array) -> Array:
         """Actions that ask for thrusts, N, shape (..., R)."""
-        return share_of(thrust - self._hover, self._up, self._down)
+        return self._rotors.share(thrust)
 
 
 class MixedController:

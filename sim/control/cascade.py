@@ -22,10 +22,10 @@ from functools import reduce
 import numpy as np
 
 from ... import models
-from ...models.matrices import dot
+from ...models.matrices import dot, times
 from ..effects import EffectOptions
 from ..elementary import cos, polynomial, sin
-from ..rotations import Parts, Rows, axes_of, times
+from ..rotations import Parts, Rows, axes_of
 from ..state import Array, WorldState, clip, interpolated, parts_of, square_root, stack
 from .gains import Gains
 
@@ -34,6 +34,30 @@ _ASIDE = 1e-3  # Upside down every way to turn is as short: it is about x
 _TINY = 1e-12  # Added to squares under a root, whose slope at 0 is infinite
 _STEPS = 1024  # of the table that inverts a thrust curve: right to 1e-6
 _HALVINGS = 53
+
+
+class AroundHover:
+    """Thrusts as numbers in [-1, 1]: 0 is the thrust at hover, -1 the least, 1 the largest.
+
+    Args:
+        low, hover, high: These thrusts, N, numbers or of each rotor, (R,).
+    """
+
+    def __init__(self, low: Array, hover: Array, high: Array) -> None:
+        self._hover = hover
+        self._up = high - hover
+        self._down = hover - low
+
+    def thrust(self, share: Array) -> Array:
+        """N, of numbers; one beyond a bound counts as the bound."""
+        above = clip(share, 0.0, 1.0)
+        below = clip(share, -1.0, 0.0)
+        return self._hover + self._up * above + self._down * below
+
+    def share(self, thrust: Array) -> Array:
+        """The numbers of thrusts, N."""
+        over = thrust - self._hover
+        return over / np.where(over > 0.0, self._up, self._down)
 
 
 class Rates:
@@ -58,9 +82,8 @@ class Rates:
         self.constants: dict[str, float | Numbers] = {"action_scale": self._sizes}
         self._mass = vehicle.mass
         self._gravity = vehicle.gravity
-        self._hover = vehicle.mass * vehicle.gravity
-        self._up = gains.highest - self._hover
-        self._down = self._hover - gains.lowest
+        hover = vehicle.mass * vehicle.gravity
+        self.collective = AroundHover(gains.lowest, hover, gains.highest)
         self._inertia = vehicle.inertia.tolist()
         self._low = vehicle.thrust_low.tolist()
         self._high = vehicle.thrust_high.tolist()
@@ -76,7 +99,7 @@ class Rates:
     def thrust(self, action: Array, state: WorldState) -> Array:
         """As `Controller.thrust`."""
         share, *rates = self._scaled(action)
-        return self.turn(self._collective(share), rates, state)
+        return self.turn(self.collective.thrust(share), rates, state)
 
     def turn(self, collective: Array, rates: Parts, state: WorldState) -> Array:
         """Thrusts, N, shape (..., R), for a collective thrust, N, and body rates, rad/s."""
@@ -129,14 +152,6 @@ class Rates:
         pairs = zip(parts_of(action), self._sizes, strict=True)
         return [size * clip(part, -1.0, 1.0) for part, size in pairs]
 
-    def _collective(self, share: Array) -> Array:
-        """N, of a number in [-1, 1]."""
-        return self._hover + self._up * clip(share, 0.0, 1.0) + self._down * clip(share, -1.0, 0.0)
-
-    def share(self, collective: Array) -> Array:
-        """The number that asks for a collective thrust, N."""
-        return share_of(collective - self._hover, self._up, self._down)
-
 
 class Attitude(Rates):
     """Collective thrust, roll, pitch and yaw rate.
@@ -160,7 +175,7 @@ class Attitude(Rates):
         cosine = cos(roll)
         x, y = turned(axes[0], cosine * sin(pitch), -sin(roll))
         axis = x, y, cosine * cos(pitch)
-        return self.point(self._collective(share), axis, yaw_rate, axes, state)
+        return self.point(self.collective.thrust(share), axis, yaw_rate, axes, state)
 
     def point(
         self, collective: Array, axis: Parts, yaw_rate: Array, axes: Rows, state: WorldState
@@ -275,11 +290,6 @@ def _throttle(curve: Numbers) -> np.ndarray:
         low = np.where(is_below, middle, low)
         high = np.where(is_below, high, middle)
     return low
-
-
-def share_of(over: Array, up: Array, down: Array) -> Array:
-    """Actions that ask for thrusts over a hover's, whose ranges above and below it are given, N."""
-    return over / np.where(over > 0.0, up, down)
 
 
 def turned(nose: Parts, x: Array, y: Array) -> tuple[Array, Array]:

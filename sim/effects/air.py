@@ -7,8 +7,8 @@ import numpy as np
 
 from ... import models
 from ...models import InputError
-from ...models.matrices import cross, dot, rotation
-from ..rotations import Parts, Rows, add, product, times, transposed
+from ...models.matrices import cross, dot, rotation, times
+from ..rotations import Parts, Rows, add, product, transposed
 from ..snapshots import Kept
 from ..state import (
     Array,

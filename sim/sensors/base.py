@@ -106,9 +106,7 @@ class Sensor(Source):
         interval: Time between two readings, s.
     """
 
-    arrays: ClassVar[tuple[str, ...]] = ("_held", "_readings")
-    _held: Array = None
-    """The last reading that was taken."""
+    arrays: ClassVar[tuple[str, ...]] = ("_readings",)
     _readings: Array = None
     """What is observed, with its flag, and those on their way: (W, A, lag + 1, k + 1)."""
 
@@ -158,7 +156,6 @@ class Sensor(Source):
         """First reading of the drones of a mask."""
         self.draw(mask, self._noise.normal(mask)[..., :-1])
         first = self._read(self._noise.normal(mask))
-        self._held = chosen(mask, first, self._held)
         readings = filled(_flagged(first, 0.0), self.values["lag"] + 1)
         readings[:, :, 0, -1] = 1.0
         self._readings = chosen(mask, readings, self._readings)
@@ -167,15 +164,15 @@ class Sensor(Source):
         """After a control step of the drones of a mask; `steps` counts those of each episode."""
         due = mask & (steps % self.values["every"] == 0)
         fresh = due
+        parameters = self.world.parameters
+        frozen = parameters.get(f"{self.about.name}_frozen", 0.0)
+        lost = parameters.get(f"{self.about.name}_lost", 0.0)
+        held = self._readings[:, :, -1, :-1] * np.expand_dims(lost == 0, -1)
         if some(due):
             normal = self._noise.normal(due)
-            parameters = self.world.parameters
-            frozen = parameters.get(f"{self.about.name}_frozen", 0.0)
-            lost = parameters.get(f"{self.about.name}_lost", 0.0)
             fresh = due & (normal[..., -1] >= self._lost) & (frozen + lost == 0)
-            held = self._held * np.expand_dims(lost == 0, -1)
-            self._held = chosen(fresh, self._read(normal), held)
-        readings = pushed(self._readings, _flagged(self._held, fresh))
+            held = chosen(fresh, self._read(normal), held)
+        readings = pushed(self._readings, _flagged(held, fresh))
         self._readings = chosen(mask, readings, self._readings)
 
     def draw(self, mask: Array, normal: Array) -> None:

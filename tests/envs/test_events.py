@@ -167,6 +167,14 @@ def test_a_sensor_fails_and_works_again(failure: str, held: bool) -> None:
         assert told[step].tobytes() == usual[step].tobytes()
 
 
+def test_a_slow_sensor_that_is_lost_reads_0_at_once() -> None:
+    event = {"kind": "sensor", "sensor": "gps", "failure": "lost", "at": 0.06}
+    gps = {"noise": 0.1, "velocity_noise": 0.1, "vertical_noise": 0.1, "rate": 10.0}
+    told = [one["gps"] for one in flown([event], hovering(4), sensors={"gps": gps})]
+    assert told[3].any()
+    assert not told[4].any()
+
+
 def test_actions_are_late_by_a_delay() -> None:
     dice = np.random.default_rng(0)
     actions = dice.uniform(-0.1, 0.1, (6, 1, 4)).astype(np.float32)

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
-from rotorgram.models.matrices import rotation
+from rotorgram.models.matrices import rotation, times
 from rotorgram.sim import rotations
 from tables import SIM
 
@@ -45,8 +45,8 @@ def test_vectors_by_their_components() -> None:
     assert rotations.cross(V, (4.0, 5.0, 6.0)) == (-3.0, 6.0, -3.0)
     turn = rotation(LEFT)
     expected = (-2.0, 1.0, 3.0)
-    assert rotations.times(turn, V) == pytest.approx(expected)
-    found = rotations.times(rotations.transposed(turn), V)
+    assert times(turn, V) == pytest.approx(expected)
+    found = times(rotations.transposed(turn), V)
     expected = (2.0, -1.0, 3.0)
     assert found == pytest.approx(expected)
 
