@@ -106,7 +106,7 @@ class A2C(Learner):
         if sequences is not None:
             found[...] = 0.0
             found[..., kept] = slopes
-        self._both.backward(found)
+        self._both.learn(found)
         by_weights = self.weights.slopes
         by_weights *= self._learned
         return float(gains.sum()) / count, entropy, float(errors.dot(errors)) / count
@@ -121,15 +121,14 @@ class A2C(Learner):
         after = self.seen(rollout.next_observations, rollout.kept & ~rollout.terminated)
         own = self.sequences(rollout, 1)
         values = self._values(seen, own)
-        following = np.empty_like(values)
-        following[:-1] = values[1:]
+        following = np.roll(values, -1, axis=0)
         # The next row has the same observation, unless an episode ends between them.
         new = rollout.ends.copy()
         new[-1] = True
         memory = self._critic.memory
         if memory:
             states = memory.states
-            self._memory[1] = np.where(rollout.ends[-1], np.float32(0.0), states[:, -1])
+            self._memory[1] = np.where(rollout.ends[-1], 0.0, states[:, -1])
             once = np.zeros((1, int(new.sum())), bool)
             own = Sequences(states[:, new], once, once)
         following[new] = self._values(after[new], own)

@@ -66,7 +66,7 @@ class APG(Learner):
         (output,) = outputs = self._both.forward(rollout.rows(rollout.observations).T)
         _, entropy = self._actor.head.score(output, rollout.rows(rollout.actions).T)
         output[...] = rollout.rows(self.slopes(rollout)).T
-        self._both.backward(outputs)
+        self._both.learn(outputs)
         clip_norm(self.weights.slopes, self.config.max_grad_norm)
         self.terms = {"gain": rollout.rows(rollout.rewards).mean(), "entropy": entropy}
 

@@ -22,7 +22,7 @@ from ..envs.config import EnvConfig
 from ..envs.spec import EnvSpec
 from ..models import Backend
 from ..models.errors import InputError, one_line, require, shortened
-from ..models.fields import check_fields, immutable
+from ..models.fields import check_fields, immutable, mapping
 from ..models.files import software_versions, write_whole
 from .config import Config
 from .episodes import Episode, Flown, Long, Position, ResumeError
@@ -181,8 +181,7 @@ def _read(data: bytes, parse: Callable[[bytes], ByName]) -> Checkpoint:
         **{name: content[name] for name in _PLAIN},
     )
     check_fields(checkpoint)
-    if not isinstance(checkpoint.versions, dict):
-        raise InputError(f"versions: expected values by name, got {checkpoint.versions!r:.80}")
+    mapping(checkpoint.versions, "versions", "values by name")
     needed = vars(checkpoint.hyperparameters)
     if needed.keys() != checkpoint.config.keys():
         raise InputError(

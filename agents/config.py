@@ -13,6 +13,8 @@ Positive = Annotated[float, Limits(0.0, 1e30, above=True)]
 Share = Annotated[float, Limits(0.0, 1.0)]
 Sizes = Annotated[tuple[int, ...], Limits(1, whole=True, count=0)]
 """At least one, each at least 1."""
+LOG_STD = Limits(-4.0, 1.0)
+"""Of the logarithm of a standard deviation."""
 
 
 @immutable
@@ -39,7 +41,7 @@ class Config:
     """Factor of the rewards that it learns from; returns are shown without it."""
     reward_clip: Positive | None = None
     """Largest size of a reward that it learns from, after `reward_scale`; null: any."""
-    log_std: Annotated[float, Limits(-4.0, 1.0)] = -0.5
+    log_std: Annotated[float, LOG_STD] = -0.5
     """Initial logarithm of the policy's standard deviation, in units of the action."""
 
     squashed: ClassVar[bool] = False

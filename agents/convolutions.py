@@ -7,14 +7,18 @@ circle.
 
 import math
 from collections.abc import Sequence
+from typing import Literal
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from ..envs.spec import IMAGE, PICTURE, RINGS, ArraySpec
 from .layers import Affine, Chain, Floats, Layer, sized
 
 Places = NDArray[np.int64]
+Beyond = Literal["edge", "wrap"]
+"""How an array goes on beyond its ends."""
 
 
 class Convolution(Affine):
@@ -125,34 +129,32 @@ def convolutions(
 
     Windows have three places along each axis, around every second place.
     """
-    circle = array.axes == RINGS
-    channels = array.shape[0] if circle else math.prod(array.shape[2:])
-    sizes = array.shape[1:] if circle else array.shape[:2]
-    # Steps from channel to channel, and from place to place.
-    apart, step = (math.prod(sizes), 1) if circle else (1, channels)
+    numbers = first + np.arange(array.size).reshape(array.shape)
+    beyond: Beyond = "wrap"
+    if array.axes != RINGS:
+        beyond = "edge"
+        numbers = np.moveaxis(numbers.reshape(*array.shape[:2], -1), -1, 0)
     layers: list[Layer] = []
     for count in filters:
-        windows = step * _windows(sizes, circle)
-        starts = first + apart * np.arange(channels)
-        places = starts[:, None, None] + windows
-        layers += [Convolution(inputs, places.reshape(-1, windows.shape[1]), count), activation()]
-        sizes = tuple(-(-size // 2) for size in sizes)
-        apart, step = math.prod(sizes), 1
-        first = 0
-        channels = count
+        layers += [Convolution(inputs, _windows(numbers, beyond), count), activation()]
+        sizes = [-(-size // 2) for size in numbers.shape[1:]]
         inputs = count * math.prod(sizes)
+        numbers = np.arange(inputs).reshape(count, *sizes)
     return layers, inputs
 
 
-def _windows(sizes: Sequence[int], circle: bool) -> Places:
-    """Places of a channel in each window, shape (3 or 9, windows); a row has none twice."""
-    found = np.zeros((1, 1), np.int64)
-    for size in sizes:
-        places = np.arange(0, size, 2) + np.array([[-1], [0], [1]])
-        places = places % size if circle else places.clip(0, size - 1)
-        sums = found[:, None, :, None] * size + places[None, :, None, :]
-        found = sums.reshape(len(found) * 3, -1)
-    return found
+def _windows(numbers: Places, beyond: Beyond) -> Places:
+    """The inputs of each window, shape (3 or 9 times channels, windows); a row has none twice.
+
+    The inputs' numbers have shape (channels, ...), and go on as `beyond` says.
+    """
+    channels, *sizes = numbers.shape
+    padded = np.pad(numbers, [(0, 0), *[(1, 1)] * len(sizes)], beyond)
+    axes = tuple(range(1, numbers.ndim))
+    neighbours = sliding_window_view(padded, sizes, axes)  # (channels, 3..., sizes)
+    every_second = [slice(None)] * numbers.ndim + [slice(None, None, 2)] * len(sizes)
+    windows: Places = neighbours[tuple(every_second)]
+    return windows.reshape(channels * 3 ** len(sizes), -1)
 
 
 def slices(sizes: Sequence[int]) -> list[slice]:

@@ -50,9 +50,13 @@ class Geometric:
         self._scale = spec.action_scale
         seen = [name for array in spec.observation for name in component_names(array)]
         places = {name: place for place, name in enumerate(seen)}
-        self._at = {v: _vector(places, v) for v in (*_VECTORS, *_PAYLOAD)}
+        self._at: dict[str, list[int]] = {}
+        for vector in (*_VECTORS, *_PAYLOAD):
+            components = [f"{vector} {axis}" for axis in "xyz"]
+            if places.keys() >= {*components}:
+                self._at[vector] = [places[name] for name in components]
         for vector in _VECTORS:
-            if not self._at[vector]:
+            if vector not in self._at:
                 raise InputError(
                     f"geometric: expected the observation '{vector} x', "
                     f"got {spec.env_id} without it"
@@ -62,7 +66,7 @@ class Geometric:
         self._pull = 0.0  # of the payload on the craft, m/s² per m that it hangs aside
         share = spec.options.get("payload_share")
         cable = spec.options.get("cable")
-        if share and cable and all(self._at[vector] for vector in _PAYLOAD):
+        if share and cable and self._at.keys() >= {*_PAYLOAD}:
             self._swing = swing_gains(self._gain, self._gravity / cable, share)
             self._pull = share * self._gravity / cable
         self._spec = spec
@@ -79,7 +83,7 @@ class Geometric:
     def act(self, observation: Observation) -> Floats:
         """Offset and heading as the env's action, float32, shape (4,)."""
         numbers = flat(observation, self._spec).astype(np.float64)
-        now = {name: numbers[at] for name, at in self._at.items() if at}
+        now = {name: numbers[at] for name, at in self._at.items()}
         over_hover = numbers[self._rotors].mean() if self._rotors else 0.0
         lift = self._gravity * (1.0 + over_hover)
         now["force"] = lift * now["thrust axis"] - (0.0, 0.0, self._gravity)
@@ -133,12 +137,6 @@ def level_action(vector: Iterable[float], c: float, s: float, turn: float, scale
     action[:2] /= max(1.0, math.hypot(*action[:2]))
     clipped: Floats = np.clip(action, -1.0, 1.0).astype(np.float32)
     return clipped
-
-
-def _vector(places: Mapping[str, int], name: str) -> list[int]:
-    """Places of the components of a vector in the observation; empty where one is missing."""
-    names = [f"{name} {axis}" for axis in "xyz"]
-    return [places[one] for one in names] if places.keys() >= {*names} else []
 
 
 def swing_gains(position: float, frequency: float, share: float) -> Array:

@@ -5,10 +5,8 @@ import math
 import numpy as np
 from numpy.random import Generator
 
+from .config import LOG_STD
 from .layers import Floats, Module, Weights
-
-_LOG_STD = (np.float32(-4.0), np.float32(1.0))
-"""Least and greatest logarithm of a standard deviation."""
 
 
 class Head(Module):
@@ -84,7 +82,7 @@ class Gaussian(Head):
 
     def clamp(self) -> None:
         """Keep the standard deviation between e^-4 and e."""
-        np.clip(self.log_std, *_LOG_STD, out=self.log_std)
+        np.clip(self.log_std, LOG_STD.low, LOG_STD.high, out=self.log_std)
 
 
 class Categorical(Head):

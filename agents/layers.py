@@ -23,8 +23,7 @@ Parts = dict[str, Floats]
 ByName = dict[str, np.ndarray]
 Shapes = Mapping[str, tuple[int, ...]]
 Item = TypeVar("Item")
-BRIGHTEST = np.float32(255.0)  # of a byte of a picture
-_ZERO, _QUARTER, _HALF, _ONE, _TWO = map(np.float32, (0.0, 0.25, 0.5, 1.0, 2.0))
+BRIGHTEST = 255.0  # of a byte of a picture
 
 
 def named(prefix: str, items: Mapping[str, Item]) -> dict[str, Item]:
@@ -160,7 +159,7 @@ class Relu(Layer):
 
     def forward(self, inputs: Floats) -> Floats:
         self._outputs = inputs[..., 1:, :]
-        np.maximum(self._outputs, np.float32(0.0), out=self._outputs)
+        np.maximum(self._outputs, 0.0, out=self._outputs)
         return inputs
 
     def back(self, slope: Floats) -> Floats:
@@ -179,7 +178,7 @@ class Tanh(Layer):
     def back(self, slope: Floats) -> Floats:
         outputs = self._outputs
         np.square(outputs, out=outputs)
-        np.subtract(np.float32(1.0), outputs, out=outputs)
+        np.subtract(1.0, outputs, out=outputs)
         slope *= outputs
         return slope
 
@@ -247,19 +246,19 @@ class Scaling(Layer):
         self._seen = seen = inputs[..., 1:, :]
         for place in self.distances:
             values = seen[..., place, :]
-            np.maximum(values, _ZERO, out=values)
-            values *= _HALF
-            values += _ONE
-            np.divide(_TWO, values, out=values)
-            values -= _HALF
+            np.maximum(values, 0.0, out=values)
+            values *= 0.5
+            values += 1.0
+            np.divide(2.0, values, out=values)
+            values -= 0.5
         for place in self.pictures:
             seen[..., place, :] /= BRIGHTEST
         return inputs
 
     def back(self, slope: Floats) -> Floats:
         for place in self.distances:
-            values = self._seen[..., place, :] + _HALF
-            slope[..., place, :] *= -_QUARTER * values * values
+            values = self._seen[..., place, :] + 0.5
+            slope[..., place, :] *= -0.25 * values * values
         for place in self.pictures:
             slope[..., place, :] /= BRIGHTEST
         return slope

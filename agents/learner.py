@@ -146,5 +146,5 @@ class Learner:
 
 def seeds_of(seed: int) -> tuple[int, np.random.Generator]:
     """Seed of the weights and generator of the actions, independent of each other."""
-    weights = np.random.SeedSequence(seed, spawn_key=(0,)).generate_state(1, np.uint64)[0]
-    return int(weights), np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(1,)))
+    weights, actions = np.random.SeedSequence(seed).spawn(2)
+    return int(weights.generate_state(1, np.uint64)[0]), np.random.default_rng(actions)

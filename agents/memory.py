@@ -82,7 +82,7 @@ class GRU(Affine):
         states = []
         self._steps = []
         for step, begins in enumerate(given.begins):
-            before = np.where(begins, np.float32(0.0), state)
+            before = np.where(begins, 0.0, state)
             own = _thirds(by_time[..., step, :])
             recalled = _thirds(self.recurrent @ before)
             update = _sigmoid(own[0] + recalled[0])
@@ -143,6 +143,5 @@ def _thirds(gates: Floats) -> list[Floats]:
 
 
 def _sigmoid(sums: Floats) -> Floats:
-    half = np.float32(0.5)
-    found: Floats = half + half * np.tanh(half * sums)
+    found: Floats = 0.5 + 0.5 * np.tanh(0.5 * sums)
     return found

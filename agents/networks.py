@@ -22,6 +22,7 @@ class Network(Chain):
     """Layers in a row, from inputs (..., n, B) to outputs (..., k, B): an MLP (paper, section 2.3).
 
     Distances and pictures are scaled; then come the encoder and the memory, if it has them.
+    `learn` may be called once after a `forward`: it overwrites the slope and what that returned.
     Another kind overrides `build`.
 
     Attributes:
@@ -78,13 +79,6 @@ class Network(Chain):
         if self.memory:
             self.memory.sequences = sequences
         return super().forward(self._inputs)[..., 1:, :]
-
-    def backward(self, slope: Floats) -> None:
-        """Set the gradients of a loss, from its derivatives by the last outputs, (..., k, B).
-
-        Once after a `forward`; the slope and what that returned are overwritten.
-        """
-        self.learn(slope)
 
 
 class CNN(Network):

@@ -88,8 +88,7 @@ def find_preset(algorithm: str, name: str, env_id: str = DEFAULT_TASK) -> Preset
     flight = {name: settings.pop(name) for name in _FLIGHT if name in settings}
     if not found:  # no other task was flown without contact
         flight.pop("backend", None)
-    config = row.config(**settings)
-    return Preset(config=config, env_id=task, fits=found is not None, **flight)
+    return Preset(config=row.config(**settings), env_id=task, fits=found is not None, **flight)
 
 
 def preset(algorithm: str, name: str, env_id: str = DEFAULT_TASK, **changes: Any) -> Config:

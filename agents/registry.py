@@ -5,7 +5,7 @@ if it has any, are in `presets.toml`.
 """
 
 from dataclasses import dataclass
-from importlib import import_module
+from pkgutil import resolve_name
 from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
 from ..models.errors import InputError
@@ -24,7 +24,7 @@ Agent: TypeAlias = "Learner | SB3Agent"
 class Algorithm:
     """A row of the registry. Its classes are imported when they are used.
 
-    They are named as "module:Class"; a module that begins with a dot is of this package.
+    They are named as "module:Class".
     """
 
     label: str
@@ -39,17 +39,12 @@ class Algorithm:
     @property
     def config(self) -> Any:
         """Class of its hyperparameters."""
-        return _find(self.config_name)
+        return resolve_name(self.config_name)
 
     @property
     def agent(self) -> Any:
         """Class of what learns. Raises `MissingPackage` where SB3 is not installed."""
-        return _find(self.agent_name)
-
-
-def _find(name: str) -> Any:
-    module, _, one = name.partition(":")
-    return getattr(import_module(module, __package__), one)
+        return resolve_name(self.agent_name)
 
 
 ALGORITHMS = {name: Algorithm(**row) for name, row in read_own_toml(__file__, "algorithms").items()}

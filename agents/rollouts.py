@@ -118,7 +118,7 @@ class Collector:
         last = log.env_steps + most_steps
         flown = []
         while rounds and log.env_steps < last:
-            rollout, lost, done = self._fly(None, last - log.env_steps)
+            rollout, lost, done = self._fly(None, last)
             rollout = rollout.without_episodes(lost)
             if not done and log.num_envs > 1:
                 rollout = replace(rollout, kept=np.zeros_like(rollout.kept))
@@ -128,8 +128,8 @@ class Collector:
         columns = zip(*(vars(part).values() for part in flown), strict=True)
         return Rollout(*map(np.concatenate, columns))
 
-    def _fly(self, length: int | None, most_steps: int | None) -> tuple[Rollout, Mask, bool]:
-        """`length` steps of all drones; or an episode of each, if it takes at most `most_steps`.
+    def _fly(self, length: int | None, last: int | None) -> tuple[Rollout, Mask, bool]:
+        """`length` steps of all drones; or an episode of each, if it ends by the env step `last`.
 
         Returns the rollout; the steps in which a simulator was lost, bool, shape (T, N); and
         whether all drones are at the end of an episode.
@@ -138,14 +138,13 @@ class Collector:
         env = log.env
         count = log.num_envs
         log.start()
-        stop = None if most_steps is None else log.env_steps + most_steps
         block = length or max(256 // count, 1)
         memory = self.policy.memory
         state = memory.state.copy() if memory else np.zeros((0, count), np.float32)
         rows: list[tuple[Array, ...]] = []
         observations = log.observations
         waiting = int(np.count_nonzero(log.done))
-        while len(rows) != length and (stop is None or log.env_steps < stop):
+        while len(rows) != length and (last is None or log.env_steps < last):
             if not len(rows) % block:
                 drawn = self.policy.head.noise(self.rng, block * count)
                 noise = drawn.reshape(block, count, -1)
@@ -155,7 +154,7 @@ class Collector:
                 raise Diverged("actions are not finite")
             flying = ~log.out
             idle = log.done if waiting else None
-            if stop is None:
+            if last is None:
                 log.fly(actions, idle, None)
             else:
                 log.fly(actions, None, idle)
@@ -167,12 +166,12 @@ class Collector:
             observations = after
             waiting = int(np.count_nonzero(log.done))  # of few drones faster than `any`
             if waiting == count:
-                if stop is not None:
+                if last is not None:
                     break
                 log.begin(log.done)
                 observations = log.observations
                 waiting = 0
-        if waiting and (stop is None or waiting == count):
+        if waiting and (last is None or waiting == count):
             log.begin(log.done)
         *columns, lost = (np.array(column) for column in zip(*rows, strict=True))
         return Rollout(state, *columns), lost, waiting == count

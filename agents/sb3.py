@@ -134,7 +134,7 @@ class RecordedEnv(VectorEnv[Floats, Floats, np.ndarray]):
             terminated = terminated | (starting & ~truncated)
         ended = terminated | truncated
         info = {"final_obs": final, "_final_obs": ended} if ended.any() else {}
-        observations = np.where(recorder.out[:, None], np.float32(0), recorder.observations)
+        observations = np.where(recorder.out[:, None], 0.0, recorder.observations)
         return observations, rewards, terminated, truncated, info
 
 
@@ -177,13 +177,10 @@ class SB3Agent:
             optimizer = {"eps": ours.epsilon, "foreach": True}
             policy |= {"log_std_init": config.log_std, "optimizer_kwargs": optimizer}
 
-        def rate(_: float) -> float:
-            return self._rate
-
         self.model = _MODELS[type(config)](
             "MlpPolicy",
             SB3VecEnv(RecordedEnv(log, config)),
-            learning_rate=rate,
+            learning_rate=lambda _: self._rate,
             gamma=config.gamma,
             policy_kwargs=policy,
             seed=seeds_of(seed)[0] % 2**32,

@@ -58,8 +58,8 @@ class VPG(Learner):
         actions = rollout.rows(rollout.actions)
         (output,) = outputs = self._both.forward(observations.T)
         log_probability, entropy = self._actor.head.score(output, actions.T)
-        output[...] = self._actor.head.back(weights * np.float32(-1 / len(weights)), 0.0)
-        self._both.backward(outputs)
+        output[...] = self._actor.head.back(weights * (-1 / len(weights)), 0.0)
+        self._both.learn(outputs)
         self.terms = {"gain": (log_probability * weights).mean(), "entropy": entropy}
 
     def returns(self, rollout: Rollout) -> Floats:

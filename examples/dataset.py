@@ -25,10 +25,9 @@ from gymnasium.envs.registration import EnvSpec as GymSpec
 from numpy.typing import NDArray
 from rotorgram.envs import registry
 from rotorgram.envs.config import EnvConfig
-from rotorgram.envs.spaces import action_space, joined, observation_space
+from rotorgram.envs.spaces import action_space, info_columns, joined, observation_space
 from rotorgram.envs.spec import ArraySpec, EnvSpec
 from rotorgram.flights.recorded import read_episodes
-from rotorgram.flights.signals import telemetry_of
 from rotorgram.flights.trajectories import Trajectory
 from rotorgram.models import MAX_DRONES, InputError
 from rotorgram.models.fields import immutable
@@ -178,9 +177,8 @@ def _table(spec: EnvSpec, number: int, journal: str, episode: Trajectory) -> pa.
     columns["reward"] = with_null(episode.rewards)
     for ending in ("terminated", "truncated"):
         columns[ending] = with_null(_ends(episode, ending))
-    for signal in telemetry_of(episode):
-        for name, _, values in signal.columns():
-            columns[f"telemetry.{name}"] = pa.array(values)
+    for name, values in info_columns(spec, episode.telemetry).items():
+        columns[f"telemetry.{name}"] = pa.array(values)
     return pa.table(columns)
 
 
@@ -264,10 +262,7 @@ def _buffer(spec: EnvSpec, episode: Trajectory) -> "EpisodeBuffer":
     """An episode for Minari."""
     from minari.data_collector.episode_buffer import EpisodeBuffer
 
-    infos = {}
-    for signal in telemetry_of(episode):
-        for name, _, values in signal.columns():
-            infos[name] = values.tolist()
+    telemetry = info_columns(spec, episode.telemetry)
     return EpisodeBuffer(
         seed=episode.seed,
         observations=joined(spec, dict(episode.observations)),
@@ -275,7 +270,7 @@ def _buffer(spec: EnvSpec, episode: Trajectory) -> "EpisodeBuffer":
         rewards=episode.rewards,
         terminations=_ends(episode, "terminated"),
         truncations=_ends(episode, "truncated"),
-        infos=infos,
+        infos={name: values.tolist() for name, values in telemetry.items()},
     )
 
 

@@ -36,21 +36,17 @@ def moments(trajectory: Trajectory) -> list[Moment]:
     """
     spec = trajectory.spec
     spec.check_telemetry(("position", "attitude", "thrust"), "pictures")
-    found = []
-    for step, reward in enumerate([0.0, *trajectory.rewards.tolist()]):
-        readings = trajectory.readings(step)
-        episode = trajectory.episode
-        found.append(
-            moment(
-                spec,
-                trajectory.row(step),
-                step=step,
-                reward=reward,
-                episode=episode,
-                readings=readings,
-            )
+    return [
+        moment(
+            spec,
+            trajectory.row(step),
+            step=step,
+            reward=reward,
+            episode=trajectory.episode,
+            readings=trajectory.readings(step),
         )
-    return found
+        for step, reward in enumerate([0.0, *trajectory.rewards.tolist()])
+    ]
 
 
 @immutable
@@ -77,8 +73,8 @@ class FilmTrack:
 
     def note(self, episode: int, step: int) -> str:
         """Which trajectories have ended at a step otherwise than by the clock."""
-        ended = [one.ending for one in self.episodes[episode] if step >= len(one)]
-        early = [ending for ending in ended if ending != "truncated"]
+        ended = [one for one in self.episodes[episode] if step >= len(one)]
+        early = [one.ending for one in ended if one.ending != "truncated"]
         if self.drones == 1:
             return "".join(early)
         return f"{len(early)} of {self.drones} ended" if early else ""

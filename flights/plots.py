@@ -8,11 +8,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from ..envs.spec import ArraySpec
 from ..models.errors import InputError, require
 from ..scenes.solids import Solids
 from ..sim.rotations import euler
 from .palette import FLIGHT_COLORS
-from .signals import QUATERNION, Column, Signal, signals_of
+from .signals import QUATERNION, Column, columns_of_array
 from .trajectories import Floats, Trajectory, common_scene
 
 if TYPE_CHECKING:
@@ -28,10 +29,11 @@ _FIRST = (
     "position", "velocity", "attitude", "body_rates", "rates", "wind", "thrust", "battery",
     "voltage",
 )  # fmt: skip
-"""Order of the signals; others follow."""
+"""Order of the telemetry; other arrays follow."""
 _ON_POSITION = {"goal": "--", "payload": ":"}
-"""Signals that are drawn beside the position, and their line style."""
-_HIDDEN = ("time", "drawn", "action", "reward")
+"""Arrays that are drawn beside the position, and their line style."""
+_HIDDEN = ("time", "drawn")
+_ANGLES = ArraySpec(name="attitude", shape=(3,), unit="deg", components=("roll", "pitch", "yaw"))
 _WIDTH = 11.0  # inches
 _ROW = 1.75  # inches
 _PLAN_SIZE = (9.0, 5.4)  # inches
@@ -41,7 +43,7 @@ _CELLS = 600  # along each side of the grid of distances whose contours are the 
 def plot_flights(flights: Mapping[str, Trajectory], out: Path, *, plan: bool = False) -> None:
     """Draw flights, by the names in the legend, into a file of one of the `FORMATS`; or their plan.
 
-    A flight without a signal that another one has is not in its panels. Raises `ValueError`:
+    A flight without a number that another one has is not in its panel. Raises `ValueError`:
     another ending; `MissingPackage`: there is no matplotlib; `OSError`: it cannot be written; and
     what `drawn_plan` raises.
     """
@@ -54,17 +56,18 @@ def plot_flights(flights: Mapping[str, Trajectory], out: Path, *, plan: bool = F
 
 
 def shown_columns(flight: Trajectory) -> Columns:
-    """The numbers of a flight by name, in the order of their panels; attitude as angles."""
-    signals = {signal.name: signal for signal in signals_of(flight)}
-    names = [name for name in _FIRST if name in signals]
-    names += [name for name in signals if name not in (*_FIRST, *_HIDDEN)]
+    """The telemetry of a flight by name, in the order of its panels; attitude as angles."""
+    arrays = {array.name: array for array in flight.spec.telemetry}
+    names = [name for name in _FIRST if name in arrays]
+    names += [name for name in arrays if name not in (*_FIRST, *_HIDDEN)]
     columns: Columns = {}
     for name in names:
-        signal = signals[name]
-        if signal.components == QUATERNION:
-            angles = np.degrees(roll_pitch_yaw(signal.values))
-            signal = Signal(name, ("roll", "pitch", "yaw"), ("deg",) * 3, angles)
-        columns |= {column.name: column for column in signal.columns()}
+        array = arrays[name]
+        values = flight.telemetry[name]
+        if array.components == QUATERNION:
+            array = _ANGLES
+            values = np.degrees(roll_pitch_yaw(values))
+        columns |= {column.name: column for column in columns_of_array(array, values)}
     return columns
 
 

@@ -1,4 +1,4 @@
-"""Signals of a flight over time, z up and in SI units, and their table as CSV."""
+"""Numbers of a flight over time, z up and in SI units, and their table as CSV."""
 
 import csv
 import io
@@ -9,9 +9,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..envs.spec import Discrete, component_names, component_units
+from ..envs.spec import ArraySpec, Discrete, component_names, component_units
 from ..models.files import write_whole
-from .trajectories import Floats, Trajectory
+from .trajectories import Trajectory
 
 QUATERNION = ("qw", "qx", "qy", "qz")
 
@@ -25,60 +25,35 @@ class Column(NamedTuple):
     """Shape (T + 1,)."""
 
 
-class Signal(NamedTuple):
-    """An array of a flight's telemetry, its actions or its rewards."""
-
-    name: str
-    components: tuple[str, ...]
-    """A name for each number."""
-    units: tuple[str, ...]
-    """A unit for each number; empty for pure numbers."""
-    values: Floats
-    """Shape (T + 1, n); nan where a row has none."""
-
-    def columns(self) -> list[Column]:
-        """Each number by itself."""
-        return list(map(Column, self.components, self.units, self.values.T))
-
-
-def telemetry_of(flight: Trajectory) -> list[Signal]:
-    """All telemetry."""
-    signals = []
-    for array in flight.spec.telemetry:
-        values = flight.telemetry[array.name].reshape(len(flight) + 1, -1)
-        signals.append(Signal(array.name, component_names(array), component_units(array), values))
-    return signals
-
-
-def signals_of(flight: Trajectory) -> list[Signal]:
-    """All telemetry, then the actions and the rewards.
-
-    An action stands in the row from which it is flown, a reward in the row to which it leads.
-    """
-    action = flight.spec.action
-    actions = np.asarray(flight.actions, np.float64).reshape(len(flight), -1)
-    missing = np.full((1, actions.shape[1]), np.nan)
-    names = ("choice",) if isinstance(action, Discrete) else component_names(action)
-    units = ("",) if isinstance(action, Discrete) else component_units(action)
-    components = tuple(f"action_{name}" for name in names)
-    rewards = np.concatenate(([np.nan], flight.rewards))
-    return [
-        *telemetry_of(flight),
-        Signal("action", components, units, np.concatenate((actions, missing))),
-        Signal("reward", ("reward",), ("",), rewards[:, None]),
-    ]
+def columns_of_array(array: ArraySpec, values: np.ndarray) -> list[Column]:
+    """The numbers of an array, each by itself; `values` have shape (T + 1, *shape)."""
+    numbers = values.reshape(len(values), -1).T
+    return list(map(Column, component_names(array), component_units(array), numbers))
 
 
 def columns_of(flight: Trajectory) -> list[Column]:
-    """The time, the numbers of episode and drone, and every number of the signals."""
+    """The time, the numbers of episode and drone, the telemetry, the action and the reward.
+
+    An action stands in the row from which it is flown, a reward in the row to which it leads; nan
+    where a row has none.
+    """
+    spec = flight.spec
     rows = len(flight) + 1
     columns = [
         Column("time", "s", flight.times),
         Column("episode", "", np.full(rows, flight.episode)),
         Column("drone", "", np.full(rows, flight.drone)),
     ]
-    for signal in signals_of(flight):
-        columns += signal.columns()
+    for array in spec.telemetry:
+        columns += columns_of_array(array, flight.telemetry[array.name])
+    action = spec.action
+    if isinstance(action, Discrete):
+        action = ArraySpec(name="choice", shape=(1,))
+    actions = np.full((rows, action.size), np.nan)
+    actions[:-1] = flight.actions.reshape(len(flight), -1)
+    for name, unit, values in columns_of_array(action, actions):
+        columns.append(Column(f"action_{name}", unit, values))
+    columns.append(Column("reward", "", np.concatenate(([np.nan], flight.rewards))))
     return columns
 
 

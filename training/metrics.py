@@ -193,7 +193,7 @@ def measure_run(evaluations: DataFrame, headline: Headline) -> Measures:
     safe = headline.counts_crashes or not crashed.any()
     whole = bool(final["steady"].notna().all())
     steps = seconds = nan
-    if last > 0 and headline.held is not None:
+    if last > 0:
         steps, seconds = first_lasting_snapshot(evaluations, headline)
     return {
         **means,

@@ -22,6 +22,7 @@ from ..agents import (
 from ..agents.presets import PresetName
 from ..envs.config import DEFAULT_ENV, EnvConfig, read_keywords, source_hash
 from ..envs.registry import env_spec, load
+from ..envs.spec import json_values
 from ..flights.trajectories import EpisodeSet
 from ..models import Backend
 from ..models.errors import InputError, shortened
@@ -129,7 +130,7 @@ class Row:
             env_steps=self.env_steps or found.env_steps,
             num_envs=self.num_envs or found.whole_worlds(self.env.drones),
             backend=self.backend or found.backend or backend,
-            set=json.loads(json.dumps(dict(self.set))),
+            set=json_values(self.set),
         )
         try:
             self.run(0)

@@ -11,7 +11,6 @@ import numpy as np
 
 from .. import agents
 from ..agents import Checkpoint
-from ..agents.config import RolloutConfig
 from ..envs.autoreset import AdvancingVectorEnv
 from ..envs.config import BackendConfig, EnvConfig
 from ..envs.registry import is_known
@@ -53,9 +52,9 @@ def is_finished(kept: Checkpoint) -> bool:
 
 def _least_flown(algorithm: str, config: agents.Config, num_envs: int) -> int:
     """Env steps that a training flies at least: SB3 flies whole rollouts only."""
-    if agents.find_algorithm(algorithm).resumes or not isinstance(config, RolloutConfig):
+    if agents.find_algorithm(algorithm).resumes:
         return 1
-    return config.rollout_size(num_envs)
+    return config.least_steps(num_envs, 1)
 
 
 @dataclass
@@ -89,10 +88,14 @@ class Training:
     def resume(cls, kept: Checkpoint, env: AdvancingVectorEnv) -> "Training":
         """Go on from a checkpoint. Raises what `agents.resume_agent` raises."""
         kept.check_resumable()
-        names = ("algorithm", "seed", "env_steps", "num_envs")
-        settings = {name: getattr(kept, name) for name in names}
-        config = kept.env or config_of(kept.spec, kept.backend)
-        run = Run(env=config, config=kept.hyperparameters, **settings)
+        run = Run(
+            env=kept.env or config_of(kept.spec, kept.backend),
+            algorithm=kept.algorithm,
+            config=kept.hyperparameters,
+            seed=kept.seed,
+            env_steps=kept.env_steps,
+            num_envs=kept.num_envs,
+        )
         return cls(run, env, kept=kept)
 
     @cached_property

@@ -77,7 +77,7 @@ def test_outputs_and_gradients_are_those_of_torch() -> None:
     np.testing.assert_allclose(found, expected.detach(), rtol=1e-5, atol=1e-5)
     slope = normal(BATCH, 2)
     expected.backward(torch.from_numpy(slope))
-    network.backward(slope.T.copy())
+    network.learn(slope.T.copy())
     for name, gradient in weights.gradients.items():
         grad = theirs[name].grad
         assert grad is not None
@@ -100,10 +100,10 @@ def test_two_networks_compute_together_as_each_alone() -> None:
     seen = normal(90, BATCH)
     slope = normal(2, 2, BATCH)
     found = both.forward(seen).copy()
-    both.backward(slope.copy())
+    both.learn(slope.copy())
     for number, (network, one) in enumerate(((first, of_first), (second, of_second))):
         np.testing.assert_allclose(found[number], network.forward(seen), rtol=1e-5, atol=1e-6)
-        network.backward(slope[number].copy())
+        network.learn(slope[number].copy())
         for name, gradient in one.gradients.items():
             ours = weights.gradients[name][number]
             np.testing.assert_allclose(ours, gradient, rtol=1e-4, atol=1e-5, err_msg=name)

@@ -102,7 +102,7 @@ def test_states_and_gradients_are_those_of_torch() -> None:
     np.testing.assert_allclose(found.T, expected, rtol=1e-5, atol=1e-5)
     slope = dice(3).normal(size=(2, STEPS * NUMBER)).astype(np.float32)
     outputs.backward(torch.tensor(slope.T.reshape(STEPS, NUMBER, 2)))
-    network.backward(slope)
+    network.learn(slope)
     by_weight = torch_gru.weight_ih_l0.grad
     by_recurrent = torch_gru.weight_hh_l0.grad
     assert by_weight is not None
@@ -122,7 +122,7 @@ def test_gradients_through_resets_are_those_of_differences() -> None:
         return float((network.forward(inputs, sequences).astype(np.float64) * slope).sum())
 
     loss()
-    network.backward(slope.copy())
+    network.learn(slope.copy())
     gradient = weights.slopes.copy()
     step = np.float32(2.0**-7)
     differences = np.empty(weights.values.size)

@@ -72,7 +72,7 @@ def test_gradients_are_those_of_torch(hidden: tuple[int, ...], activation: str) 
     weighted.sum().backward()
     found = net.forward(seen.T).T
     np.testing.assert_allclose(found, output.detach(), rtol=1e-5, atol=1e-5)
-    net.backward(slope.T)
+    net.learn(slope.T)
     agree(weights, theirs)
 
 
@@ -101,7 +101,7 @@ def test_log_probability_entropy_and_their_gradients_are_those_of_torch(discrete
     weighted = expected * torch.from_numpy(slope)
     loss = weighted.sum() - 0.7 * entropy
     loss.backward()
-    ours.network.backward(ours.head.back(slope, -0.7))
+    ours.network.learn(ours.head.back(slope, -0.7))
     agree(ours.weights, theirs)
 
 
@@ -199,7 +199,7 @@ def test_distances_come_in_as_nearness() -> None:
     np.testing.assert_allclose(got, outputs.detach().numpy().T, rtol=1e-5, atol=1e-6)
     slope = normal(2, BATCH)
     outputs.backward(torch.tensor(slope.T))
-    network.backward(slope.copy())
+    network.learn(slope.copy())
     agree(weights, arrays)
     network.forward(inputs)
     back = network.back(slope.copy())
