@@ -139,7 +139,7 @@ class Vehicle(Command):
             print(f"{rotor.name:17} {place}; {torque}; {rotor.low:.6g} to {rotor.high:.6g} N")
         print("\ncameras: pictures, place")
         for camera in craft.cameras:
-            size = f"{camera.width} × {camera.height}"
+            size = "{} × {}".format(*camera.resolution)
             print(f"{camera.name:17} {', '.join(camera.kinds)} {size}, {camera.words}")
         if file:
             print(f"\nnumbers of {craft.path.name}")

@@ -10,6 +10,7 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import ArrayLike
 
 from ..models.errors import InputError
+from ..models.fields import Limits, OrNone, Rule
 from ..sim.state import some
 from .actions import Asking
 from .info import Info, LazyInfo
@@ -103,10 +104,13 @@ class AdvancingVectorEnv(Asking, VectorEnv[Observation, ArrayLike, Array]):
         mode = self.autoreset_mode
         resets = self.done if mode == AutoresetMode.NEXT_STEP and some(self.done) else None
         self.advance(actions, resets)
-        step = (self.rewards, self.terminated, self.truncated, self._info(self._everybody))
+        rewards = self.rewards
+        terminated = self.terminated
+        truncated = self.truncated
+        info = self._info(self._everybody)
         if mode == AutoresetMode.SAME_STEP and some(self.done):
-            step = self._begin_next(*step)
-        return self.observations, *step
+            truncated, info = self._begin_next(truncated, info)
+        return self.observations, rewards, terminated, truncated, info
 
     def _take_spec(self, spec: EnvSpec, num_envs: int, mode: AutoresetMode | str) -> None:
         """Set spaces and other attributes from a spec. Raises `InputError`.
@@ -126,9 +130,7 @@ class AdvancingVectorEnv(Asking, VectorEnv[Observation, ArrayLike, Array]):
         self.control_period = spec.control_period
         self.metadata = {"render_modes": [], "render_fps": spec.fps, "autoreset_mode": mode}
 
-    def _begin_next(
-        self, rewards: Array, terminated: Array, truncated: Array, last: Info
-    ) -> tuple[Array, Array, Array, Info]:
+    def _begin_next(self, truncated: Array, last: Info) -> tuple[Array, Info]:
         """SAME_STEP: reset those whose episode ended; the info gets that of their last step.
 
         A simulator that is lost meanwhile truncates the episodes of its frozen drones: they begin
@@ -144,7 +146,7 @@ class AdvancingVectorEnv(Asking, VectorEnv[Observation, ArrayLike, Array]):
         info = self._info(self._everybody)
         info |= {"final_obs": observations, "_final_obs": ended}
         info |= {"final_info": last | masks | self._losses(), "_final_info": ended.copy()}
-        return rewards, terminated, truncated, info
+        return truncated, info
 
     def _losses(self) -> Info:
         """What the info of this step says of simulators that were lost, in any round trip."""
@@ -204,26 +206,18 @@ def checked_seeds(seed: Any, num_envs: int, most: int | None = None) -> Seeds | 
 
     Where there is a largest seed, `most`, every env needs one.
     """
+    rule: Rule = OrNone(Limits(0, whole=True)) if most is None else Limits(0, most, whole=True)
     if seed is None:
         return None
     if isinstance(seed, Array) and (seed.dtype, seed.shape) == (np.uint64, (num_envs,)):
         return seed
-    numbers: Seeds = seed
+    numbers = seed
     if isinstance(seed, int | np.integer):
         numbers = range(int(seed), int(seed) + num_envs)
-    several = isinstance(numbers, Sequence | Array) and getattr(numbers, "ndim", 1) == 1
-    right = several and len(numbers) == num_envs
-    if not (right and all(_is_seed(number, most) for number in numbers)):
-        up_to = "from 0 on" if most is None else f"from 0 to 2^{most.bit_length()} - 1"
-        raise InputError(
-            f"seed: expected a whole number {up_to}, or {num_envs} of them, got {seed!r}"
-        )
-    return numbers
-
-
-def _is_seed(number: object, most: int | None) -> bool:
-    if number is None:
-        return most is None
-    if not isinstance(number, int | np.integer) or number < 0:
-        return False
-    return most is None or int(number) <= most
+    try:
+        seeds = [rule.read(number) for number in numbers]
+    except (TypeError, ValueError, OverflowError):
+        seeds = []
+    if len(seeds) != num_envs:
+        raise InputError(f"seed: expected {rule.expected}, or {num_envs} of them, got {seed!r}")
+    return seeds

@@ -27,7 +27,7 @@ from ..models.fields import (
     set_fields,
 )
 from ..models.files import read_toml
-from ..models.library import is_of_the_library, vehicle_words
+from ..models.library import is_of_the_library, words_of
 from ..scenes import SceneConfig
 from ..scenes.config import is_scene_file, refuse_hidden
 from ..scenes.returns import RANGES
@@ -135,7 +135,12 @@ class EnvConfig:
 
     def __post_init__(self) -> None:
         check_fields(self)
-        set_fields(self, env_id=canonical_id(self.env_id), vehicle=self.vehicle or ())
+        set_fields(
+            self,
+            env_id=canonical_id(self.env_id),
+            vehicle=self.vehicle or (),
+            cameras=self.cameras or (),
+        )
         task = registry.task_type(self.env_id) if registry.is_known(self.env_id) else None
         defaults: Values = {"sensors": {}, "backend": BackendConfig()}
         if task:
@@ -147,7 +152,7 @@ class EnvConfig:
         set_fields(
             self,
             backend=BackendConfig.parse(self.backend),
-            vehicle=vehicle_words(self.vehicle),
+            vehicle=words_of("vehicle", self.vehicle),
             cameras=words_of("cameras", self.cameras),
             randomize=Randomization(self.randomize, None).to_options(),
             events=read_events(self.events),
@@ -425,7 +430,7 @@ def read_keywords(path: Path | str) -> Values:
     except OSError as error:
         raise InputError(f"config: cannot read {file}: {error.strerror}") from None
     if "vehicle" in content:
-        words = vehicle_words(content["vehicle"])
+        words = words_of("vehicle", content["vehicle"])
         content["vehicle"] = tuple(_beside(file, word) for word in words)
     scene = content.get("scene", "")
     if is_scene_file(scene):
@@ -456,13 +461,3 @@ def source_hash(task: type, draw: object = None) -> str:
 def _hash_of(text: str) -> str:
     """32 hexadecimal digits."""
     return blake2b(text.encode(), digest_size=16).hexdigest()
-
-
-def words_of(name: str, given: object) -> tuple[str, ...]:
-    """Words of a text with commas, or of several texts. Raises `InputError`."""
-    texts = [given] if isinstance(given, str) else given
-    if not isinstance(texts, list | tuple) or not all(isinstance(one, str) for one in texts):
-        raise InputError(
-            f"{name}: expected names, with commas between them, got {shortened(given)}"
-        )
-    return tuple(word for text in texts for word in text.replace(",", " ").split())

@@ -4,7 +4,6 @@ An id from a checkpoint, a journal or a peer is looked up here; its module is ne
 """
 
 import os
-import re
 import sys
 from importlib import import_module
 from typing import TYPE_CHECKING, Final
@@ -12,13 +11,14 @@ from typing import TYPE_CHECKING, Final
 import gymnasium
 
 from ..models.errors import InputError, shortened
+from ..models.fields import Text, check
 from .spec import EnvSpec, canonical_id
 
 if TYPE_CHECKING:
     from .config import EnvConfig
     from .tasks.task import Task
 
-_ID = re.compile(r"([\w.-]+/)?[\w.-]+-v\d+")
+_ID = Text(r"([\w.-]+/)?[\w.-]+-v\d+", "name-v0 or namespace/name-v0")
 _tasks: Final[dict[str, "str | type[Task]"]] = {}
 
 
@@ -29,8 +29,7 @@ def register(env_id: str, task: "str | type[Task]") -> None:
     Raises `InputError` if the id is not as `name-v0` or `namespace/name-v0`, or belongs to another
     package's env.
     """
-    if not isinstance(env_id, str) or not _ID.fullmatch(env_id):
-        raise InputError(f"env id: expected name-v0 or namespace/name-v0, got {shortened(env_id)}")
+    check("env id", _ID, env_id)
     if env_id in gymnasium.registry and env_id not in _tasks:
         raise InputError(f"env id: expected one that is free, got {shortened(env_id)}")
     gymnasium.registry.pop(env_id, None)

@@ -10,7 +10,7 @@ from ..models.errors import InputError, shortened
 from ..models.fleet import members_of
 from ..scenes import SceneConfig
 from ..sim.sensors.range_sensors import RangeSensor
-from .spec import EnvSpec
+from .spec import EnvSpec, Metric
 
 if TYPE_CHECKING:
     from ..rendering import Canvas, Moment, Stage
@@ -131,6 +131,14 @@ def moments(loop: "Loop", episodes: Sequence[int]) -> "list[Moment]":
     return found
 
 
+def metric_line(metric: Metric, value: float) -> tuple[str, str]:
+    """Symbol or name of a metric, and its value with four digits and the unit."""
+    whole = len(f"{abs(value):.0f}")
+    number = f"{value:.{max(4 - whole, 0)}f}" if metric.unit else f"{value:.4g}"
+    name = metric.symbol or metric.name.replace("_", " ")
+    return name, f"{number} {metric.unit}".strip()
+
+
 def moment(spec: EnvSpec, telemetry: Mapping[str, Any], *, step: int = 0, **rest: Any) -> "Moment":
     """The `Moment` of one drone, with `step`, `reward`, `episode` and `readings` as `Moment` has
     them.
@@ -138,16 +146,15 @@ def moment(spec: EnvSpec, telemetry: Mapping[str, Any], *, step: int = 0, **rest
     Telemetry is arrays by name: `position` (3,), `attitude` (4,), `thrust` (R,), and, if there are
     any, `metrics` (M,), `goal` (3,) and `payload` (3,).
     """
-    from ..rendering import MetricValue, Moment
+    from ..rendering import Moment
 
     numbers: dict[str, Any] = {}
     for name in ("position", "attitude", "thrust", "metrics", "goal", "payload"):
         if name in telemetry:
             numbers[name] = tuple(np.asarray(telemetry[name], float).tolist())
     thrusts = numbers.pop("thrust")
-    metrics = []
-    for metric, value in zip(spec.metrics, numbers.pop("metrics", ()), strict=False):
-        metrics.append(MetricValue(metric.name, value, metric.unit, metric.symbol))
+    values = zip(spec.metrics, numbers.pop("metrics", ()), strict=False)
+    metrics = [metric_line(metric, value) for metric, value in values]
     return Moment(
         **numbers,
         thrusts=thrusts,

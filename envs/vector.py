@@ -8,14 +8,7 @@ from numpy.typing import ArrayLike
 from ..models.errors import InputError
 from ..models.fields import check_names
 from ..sim.snapshots import Arrays, Snapshot
-from .autoreset import (
-    AdvancingVectorEnv,
-    Array,
-    Observation,
-    Seed,
-    Told,
-    checked_mask,
-)
+from .autoreset import AdvancingVectorEnv, Array, Observation, Seed, Told, checked_mask
 from .compiled import make_loop
 from .config import EnvConfig
 from .info import Info

@@ -28,7 +28,6 @@ import tyro
 from numpy.random import Generator
 from numpy.typing import NDArray
 from PIL import Image
-from rotorgram.envs.config import words_of
 from rotorgram.envs.spec import Mark
 from rotorgram.flights.executors import Tell, WorkersConfig, open_executor, run_jobs
 from rotorgram.flights.folders import new_folder
@@ -45,6 +44,7 @@ from rotorgram.models.fields import (
     immutable,
 )
 from rotorgram.models.files import software_versions, write_whole
+from rotorgram.models.library import words_of
 from rotorgram.models.swarm import drone_names
 from rotorgram.rendering.cameras import Cameras
 from rotorgram.rendering.gl import offscreen_context

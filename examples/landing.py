@@ -41,7 +41,7 @@ class Landing(Task):
             ),
         )
 
-    def begin(self, mask, draw):
+    def begin(self, draw):
         height = self.options.start + draw.uniform(-1.0, 1.0)
         return InitialState(position=stack((0.0, 0.0, self.vehicle.rest_height + height)))
 

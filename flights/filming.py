@@ -243,8 +243,7 @@ class _Pane:
         if distance is not None:
             lines.append(("least distance", f"{distance:.2f} m"))
         else:
-            for metric in stage.moments[0].metrics[:1]:
-                lines.append((metric.label, metric.text))
+            lines += stage.moments[0].metrics[:1]
         for reading in stage.moments[0].readings:
             lines.append((reading.name, f"0 to {reading.reach:g} m"))
         note = track.note(episode, step)

@@ -8,8 +8,9 @@ MJCF has no word, is a custom text: "rotorgram/cameras.NAME.rate". A TOML file h
 import math
 import re
 from collections.abc import Iterable, Sequence
+from contextlib import suppress
 from dataclasses import replace
-from typing import Annotated
+from typing import Annotated, Any
 
 import mujoco
 import numpy as np
@@ -36,7 +37,6 @@ _NAME = Text(rf"[^\W\d]\w{{,{_MAX_LETTERS - 1}}}", f"up to {_MAX_LETTERS} letter
 _RESOLUTION = Limits(1, MAX_PIXELS, "pixel", whole=True, count=2)
 _DEFAULT_RESOLUTION = (64, 64)
 _KINDS = Text("|".join(OUTPUTS), f"some of {', '.join(OUTPUTS)}", several=True)
-_MAX_STEPS = 1000  # from picture to picture
 
 ORIGIN = (0.0, 0.0, 0.0)
 AHEAD = (1.0, 0.0, 0.0)
@@ -70,16 +70,12 @@ class Camera:
 
     def __post_init__(self) -> None:
         check_fields(self, f"camera {self.name}.")
-
-    @property
-    def width(self) -> int:
-        """Pixels."""
-        return self.resolution[0]
-
-    @property
-    def height(self) -> int:
-        """Pixels."""
-        return self.resolution[1]
+        steps = 1 / self.rate
+        if abs(steps - self.every) > 1e-6 * steps:
+            raise InputError(
+                f"camera {self.name}.rate: expected 1 over a whole number of control steps, "
+                f"got {self.rate}"
+            )
 
     @property
     def every(self) -> int:
@@ -112,8 +108,9 @@ class View:
     @property
     def shape(self) -> tuple[int, int, int]:
         """Rows from the top, columns from the left, channels."""
+        width, height = self.camera.resolution
         channels = 3 if self.kind == "rgb" else 1
-        return self.camera.height, self.camera.width, channels
+        return height, width, channels
 
     @property
     def dtype(self) -> str:
@@ -193,7 +190,9 @@ def read_cameras(spec: MjSpec, model: MjModel, data: MjData) -> tuple[Camera, ..
         resolution = model.cam_resolution[number].tolist()
         if resolution == [1, 1]:  # MJCF's default
             resolution = _DEFAULT_RESOLUTION
-        rate = texts.pop(f"{_TEXTS}{one.name}.rate", "1")
+        rate: Any = texts.pop(f"{_TEXTS}{one.name}.rate", "1")
+        with suppress(ValueError):  # a camera's rate is a number
+            rate = float(rate)
         output = int(model.cam_output[number])
         axes = data.cam_xmat[number].reshape(3, 3)
         mine = model.body_rootid[one.bodyid[0]] == model.jnt_bodyid[0]
@@ -205,7 +204,7 @@ def read_cameras(spec: MjSpec, model: MjModel, data: MjData) -> tuple[Camera, ..
                 up=_vector(axes[:, 1]),
                 fovy=math.radians(one.fovy[0]),
                 resolution=resolution,
-                rate=1 / steps_of(f"camera {one.name}", rate),
+                rate=rate,
                 kinds=tuple(kind for kind, bit in OUTPUTS.items() if output & bit) or ("rgb",),
                 stands=bool(not mine or one.mode != modes.mjCAMLIGHT_FIXED.value),
             )
@@ -220,21 +219,6 @@ def place_cameras(model: MjModel, data: MjData) -> None:
     mujoco.mj_kinematics(model, data)
     mujoco.mj_comPos(model, data)  # the body that cameras and lights follow
     mujoco.mj_camlight(model, data)
-
-
-def steps_of(name: str, rate: str | float) -> int:
-    """Control steps between the pictures of a camera at a rate. Raises `InputError`."""
-    try:
-        steps = 1 / float(rate)
-    except (ValueError, ZeroDivisionError):
-        steps = math.nan
-    right = 1 <= steps <= _MAX_STEPS and abs(steps - round(steps)) < 1e-6 * steps
-    if not right:
-        raise InputError(
-            f"{name}.rate: expected 1 over a whole number of control steps up to {_MAX_STEPS}, "
-            f"got {rate}"
-        )
-    return round(steps)
 
 
 def _vector(values: np.ndarray) -> _Vector:

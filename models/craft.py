@@ -68,13 +68,13 @@ def _add_actuator(
     spec: MjSpec, file: VehicleFile, rotor: PlacedRotor, site: mujoco.MjsSite
 ) -> None:
     """A motor at a site: thrust along the rotor's axis, and a reaction about it."""
-    axis = _scaled(rotor.axis, 1 / math.hypot(*rotor.axis))
+    axis = np.multiply(rotor.axis, 1 / math.hypot(*rotor.axis))
     torque = file.rotors.reaction or 0.0
     spec.add_actuator(
         name=rotor.name,
         target=site.name,
         trntype=mujoco.mjtTrn.mjTRN_SITE,
-        gear=(*axis, *_scaled(axis, torque if rotor.turn == "cw" else -torque)),
+        gear=(*axis, *np.multiply(axis, torque if rotor.turn == "cw" else -torque)),
         ctrllimited=True,
         ctrlrange=file.rotors.thrust,
     )
@@ -106,10 +106,6 @@ def _add_geom(
     )
 
 
-def _scaled(vector: Vector, factor: float) -> tuple[float, ...]:
-    return tuple(factor * one for one in vector)
-
-
 # ---- from the tables
 
 
@@ -123,7 +119,7 @@ def _build(spec: MjSpec, file: VehicleFile) -> None:
     reach = max(math.hypot(*place) for _, place in rotors)
     reach = max(reach, file.rotors.radius or 0.0, 1e-2)
     unit = reach / math.sqrt(2)  # 1 m of quad.xml
-    half = _scaled(file.body.size or _sides(file.body.parts, unit), 0.5)
+    half = np.multiply(file.body.size or _sides(file.body.parts, unit), 0.5)
     motor = 0.06 * unit
     lowest = max(half[2], *(motor - place[2] for _, place in rotors))
     clearance = file.body.ground_clearance or lowest + 0.33 * unit
@@ -151,11 +147,11 @@ def _build(spec: MjSpec, file: VehicleFile) -> None:
         if not file.body.parts and math.hypot(*place[:2]) > half[0]:
             ends = (*ORIGIN, *place)
             _add_geom(body, f"arm{number}", "cylinder", "carbon", (0.035 * unit,), fromto=ends)
-        up = _scaled(rotor.axis, 0.09 * unit / math.hypot(*rotor.axis))
+        up = np.multiply(rotor.axis, 0.09 * unit / math.hypot(*rotor.axis))
         above = np.add(place, up)
         colour = "front_disc" if place[0] > 1e-6 * reach else "disc"
         _add_disc(body, f"disc{number}", rotor, radius, above, colour)
-        blade = _scaled((0.97, 0.09, 0.018), radius)
+        blade = np.multiply((0.97, 0.09, 0.018), radius)
         turn = _along(rotor.axis) or {"euler": (0.0, 0.0, 0.4 + 1.5 * number)}
         _add_geom(body, "", "ellipsoid", "carbon", blade, pos=above, **turn)
         site = body.add_site(name=rotor.name, pos=place, group=4, size=(0.02 * unit, 0.005, 0.005))
@@ -178,7 +174,7 @@ def _sides(parts: Sequence[Box | Cylinder], unit: float) -> Vector:
     """Of the hub of a file without its size: of the heaviest box, if there are any."""
     boxes = [part for part in parts if isinstance(part, Box)]
     if not boxes:
-        return _scaled((0.44, 0.44, 0.14), unit)
+        return np.multiply((0.44, 0.44, 0.14), unit)
     return max(boxes, key=lambda box: box.mass).size
 
 
@@ -188,7 +184,7 @@ def _add_mass(body: MjsBody, file: VehicleFile) -> None:
     for number, part in enumerate(table.parts, 1):
         if isinstance(part, Box):
             kind = "box"
-            size = _scaled(part.size, 0.5)
+            size = np.multiply(part.size, 0.5)
             turn: dict[str, Any] = {"euler": (0.0, 0.0, part.yaw)}
         else:
             kind = "cylinder"

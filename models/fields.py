@@ -134,20 +134,17 @@ PositiveInt = Annotated[int, Limits(1, whole=True)]
 NonNegativeInt = Annotated[int, Limits(0, whole=True)]
 
 
-@dataclass(frozen=True)
-class NumberOrPair:
+class NumberOrPair(Limits):
     """A number within limits, or a pair (low, high) of them."""
-
-    limits: Limits
 
     @property
     def expected(self) -> str:
-        return f"{self.limits.expected}, or a pair (low, high) with low <= high"
+        return f"{super().expected}, or a pair (low, high) with low <= high"
 
     def read(self, value: Any) -> float | tuple[float, ...]:
         if not isinstance(value, tuple | list):
-            return self.limits._number(value)
-        low, high = map(self.limits._number, value)
+            return self._number(value)
+        low, high = map(self._number, value)
         if low > high:
             raise ValueError
         return low, high

@@ -12,7 +12,7 @@ from typing import Any, Self
 import numpy as np
 
 from .errors import InputError
-from .library import vehicle_words
+from .library import words_of
 from .vehicle import Vehicle
 
 _OF_DRONES = (
@@ -34,23 +34,18 @@ class Fleet(Vehicle):
     """Of each drone, under the physics step and the gravity that all share."""
 
     @classmethod
-    def of(cls, vehicles: Sequence[Vehicle]) -> Self:
-        """Of one vehicle for each drone. The physics step is the shortest of all, and gravity that
-        of the first. Raises `InputError` where they have not the same number of rotors.
+    def of(cls, members: Sequence[Vehicle]) -> Self:
+        """Of one vehicle for each drone. Raises `InputError` where they have not the same number of
+        rotors.
         """
-        first = vehicles[0]
-        for one in vehicles:
+        first = members[0]
+        for one in members:
             if one.num_rotors != first.num_rotors:
                 raise InputError(
                     f"vehicle: expected {first.num_rotors} rotors as of {first.name}, "
                     f"got {one.num_rotors} of {one.name}"
                 )
-        step = min(one.timestep for one in vehicles)
-        kinds = {one: _under(one, step, first.gravity) for one in vehicles}
-        members = tuple(kinds[one] for one in vehicles)
-        values: dict[str, Any] = {
-            one.name: getattr(members[0], one.name) for one in fields(Vehicle)
-        }
+        values: dict[str, Any] = {one.name: getattr(first, one.name) for one in fields(Vehicle)}
         for name in _OF_DRONES:
             values[name] = np.array([getattr(one, name) for one in members])
         values["name"] = ", ".join(dict.fromkeys(one.name for one in members))
@@ -58,7 +53,7 @@ class Fleet(Vehicle):
         values["hash"] = blake2b(together.encode(), digest_size=16).hexdigest()
         for name in ("radius", "rest_height"):
             values[name] = max(getattr(one, name) for one in members)
-        return cls(**values, members=members)
+        return cls(**values, members=tuple(members))
 
     @property
     def max_acceleration(self) -> float:
@@ -85,9 +80,10 @@ def load_vehicles(
     """The vehicle of all drones of a world, or a `Fleet` if several are named.
 
     Names or files go to the drones in their order, and repeat from the first if there are more
-    drones. A physics step is at most `longest_step`, s. Raises `InputError`.
+    drones. The physics step is the shortest of all, at most `longest_step`, s, and gravity that of
+    the first. Raises `InputError`.
     """
-    names = vehicle_words(vehicle) or (None,)
+    names = words_of("vehicle", vehicle) or (None,)
     if len(names) > drones:
         got = ",".join(map(str, names))
         raise InputError(
@@ -95,10 +91,12 @@ def load_vehicles(
             f"got {len(names)}: {got}"
         )
     loaded = [Vehicle.load(name, linear_drag=linear_drag) for name in names]
-    found = [_under(one, min(one.timestep, longest_step), one.gravity) for one in loaded]
-    if len(set(found)) == 1:
-        return found[0]
-    return Fleet.of([found[i % len(found)] for i in range(drones)])
+    step = min(longest_step, *(one.timestep for one in loaded))
+    kinds = {one: _under(one, step, loaded[0].gravity) for one in loaded}
+    members = [kinds[one] for one in loaded]
+    if len(kinds) == 1:
+        return members[0]
+    return Fleet.of([members[i % len(members)] for i in range(drones)])
 
 
 def members_of(vehicle: Vehicle, drones: int) -> tuple[Vehicle, ...]:

@@ -16,19 +16,25 @@ def vehicle_names() -> list[str]:
     return sorted(file.parent.name for file in LIBRARY.glob("*/vehicle.toml"))
 
 
-def vehicle_words(given: object) -> tuple[str, ...]:
-    """Names and files of vehicles, from a text with commas between them or from several texts.
+def words_of(option: str, given: object) -> tuple[str, ...]:
+    """Names or files, from a text with commas between them or from several such texts.
 
-    None gives an empty tuple. Raises `InputError`.
+    None gives an empty tuple. Raises `InputError`, whose sentence begins with the option.
     """
     if given is None:
         return ()
-    words: Sequence[object] = given if isinstance(given, list | tuple) else (given,)
-    if isinstance(given, str) and "," in given and not os.path.exists(given):
-        words = [word.strip() for word in given.split(",")]
-    if not all(isinstance(word, str | Path) for word in words):
-        raise InputError(f"vehicle: expected names or files, got {shortened(given)}")
-    return tuple(map(str, words))
+    texts: Sequence[object] = given if isinstance(given, list | tuple) else (given,)
+    if not all(isinstance(text, str | Path) for text in texts):
+        raise InputError(
+            f"{option}: expected names, with commas between them, got {shortened(given)}"
+        )
+    words: list[str] = []
+    for text in map(str, texts):
+        if os.path.exists(text):
+            words.append(text)
+        else:
+            words += [word.strip() for word in text.split(",")]
+    return tuple(words)
 
 
 def is_of_the_library(vehicle: str) -> bool:

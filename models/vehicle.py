@@ -217,6 +217,12 @@ def craft_geoms(model: MjModel) -> Array:
     return geoms
 
 
+def radius_of(model: MjModel, geoms: Array) -> float:
+    """Of a sphere about the body's origin that holds some geoms, bool, (geoms,), m."""
+    reach = np.linalg.norm(level_data(model).geom_xpos, axis=1) + model.geom_rbound
+    return float(reach[geoms].max(initial=1e-3))
+
+
 def can_touch(model: MjModel, others: Array) -> Array:
     """Which geoms may collide with one of others, bool, (geoms,)."""
     types = np.bitwise_or.reduce(model.geom_contype[others])
@@ -283,7 +289,9 @@ def _load(path: Path, drag: float, changed: tuple[int, ...]) -> Vehicle:
         columns.append((rotor.axis[2], *torque))
     allocation = np.array(columns).T
     model.dof_damping[0:3] = drag * mass
-    model.geom_group[:] = craft_geoms(model)  # what rays do not see
+    own = craft_geoms(model)
+    model.geom_group[:] = own  # what rays do not see
+    solid = own & (model.geom_contype | model.geom_conaffinity > 0)
     return Vehicle(
         path=path,
         name=str(spec.modelname),
@@ -299,7 +307,7 @@ def _load(path: Path, drag: float, changed: tuple[int, ...]) -> Vehicle:
         thrust_high=np.array([rotor.high for rotor in rotors]),
         allocation=allocation,
         hover_thrust=_hover(rotors, allocation, mass * gravity),
-        radius=_radius(model),
+        radius=float(settled(radius_of(model, solid))),
         rest_height=_find_rest_height(model, data),
         coefficients=_read_coefficients(model),
         file_cameras=cameras,
@@ -394,14 +402,6 @@ def _hover(rotors: tuple[Rotor, ...], allocation: Array, weight: float) -> Array
                 f"{newtons:.4g} N, within its limits, got {rotor.low:g} to {rotor.high:g} N"
             )
     return thrust
-
-
-def _radius(model: MjModel) -> float:
-    """Of a sphere about the body's origin that holds all that can collide, m."""
-    solid = craft_geoms(model)
-    solid &= (model.geom_contype | model.geom_conaffinity) > 0
-    reach = np.linalg.norm(level_data(model).geom_xpos, axis=1) + model.geom_rbound
-    return float(settled(reach[solid].max(initial=1e-3)))
 
 
 def _find_rest_height(model: MjModel, data: MjData) -> float:

@@ -13,8 +13,8 @@ from typing import Annotated, Any, Final, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from .cameras import AHEAD, ORIGIN, OUTPUTS, UP, Axis, Camera, Place, steps_of
-from .coefficients import COEFFICIENTS, RANGE_MODELS, table_of
+from .cameras import AHEAD, ORIGIN, OUTPUTS, UP, Axis, Camera, Place
+from .coefficients import COEFFICIENTS, RANGE_MODELS, of_group, table_of
 from .errors import InputError, shortened
 from .fields import (
     Choice,
@@ -22,6 +22,7 @@ from .fields import (
     T,
     Text,
     check,
+    check_names,
     immutable,
     limits_of,
     mapping,
@@ -105,7 +106,7 @@ class SensorTable(table_of("sensors")):  # type: ignore[misc]
 
 @immutable
 class _Model:
-    file: str
+    file: Annotated[str, Text(r"(?is).*\.(urdf|xml)", "a URDF file (.urdf) or an MJCF file (.xml)")]
 
 
 @immutable
@@ -264,11 +265,6 @@ def _listed(given: object, where: str) -> list[tuple[str, Any]]:
 def _model(path: Path, given: object) -> Path:
     file = _table([], _Model, given, "model").file
     model = path.parent / file
-    if model.suffix.lower() not in (".urdf", ".xml"):
-        raise InputError(
-            "model.file: expected a URDF file (.urdf) or an MJCF file (.xml), "
-            f"got {shortened(file)}"
-        )
     if not model.is_file():
         raise InputError(f"model.file: expected a file that is there, got {shortened(file)}")
     return model
@@ -316,12 +312,8 @@ def _rotors(numbers: _Found, given: object, model: Path | None) -> RotorTable:
     placed = tuple(_rotor(numbers, one, where, i, model) for i, (where, one) in listed)
     rotors = replace(rotors, list=placed)
     if mjcf and not placed and rotors.frame is None:  # those of the file
-        for key, value in table.items():
-            if f"rotors.{key}" not in COEFFICIENTS and key != "source":
-                got = shortened(value)
-                raise InputError(
-                    f"rotors: expected no {key} for rotors of the model's file, got {got}"
-                )
+        known = (*of_group("rotors", COEFFICIENTS), "source")
+        check_names(table, known, "rotors of the model's file")
         return rotors
     rotors = _with_thrust(rotors)
     if rotors.frame is not None and model is None:
@@ -413,7 +405,6 @@ def _camera(numbers: _Found, given: object, where: str) -> Camera:
         up = AHEAD
     if camera.resolution == (1, 1):
         raise InputError(f"{where}.resolution: expected more than one pixel, got one")
-    steps_of(where, camera.rate)
     ordered = tuple(kind for kind in OUTPUTS if kind in camera.kinds)
     return replace(camera, kinds=ordered, up=up)
 

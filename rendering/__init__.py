@@ -9,10 +9,8 @@ from .. import import_when_used
 from ..models.errors import NoOpenGL
 
 if TYPE_CHECKING:
-    from .stage import CAMERAS, Camera, Canvas, MetricValue, Moment, Stage
+    from .stage import CAMERAS, Camera, Canvas, Moment, Stage
 
-__all__ = [
-    "CAMERAS", "Camera", "Canvas", "MetricValue", "Moment", "NoOpenGL", "Stage",
-]  # fmt: skip
+__all__ = ["CAMERAS", "Camera", "Canvas", "Moment", "NoOpenGL", "Stage"]
 
 __getattr__ = import_when_used(__name__)

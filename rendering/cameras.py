@@ -103,8 +103,8 @@ class Cameras:
     @cached_property
     def _drawing(self) -> Offscreen:
         """Opened with the first picture, so that a process may be forked before."""
-        height = max(view.camera.height for view in self.views)
-        width = max(view.camera.width for view in self.views)
+        height = max(view.shape[0] for view in self.views)
+        width = max(view.shape[1] for view in self.views)
         return Offscreen(self.model, width, height, fine=self._fine)
 
     def open(self) -> None:

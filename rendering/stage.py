@@ -7,7 +7,7 @@ from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
-from typing import Annotated, Literal, NamedTuple, get_args
+from typing import Annotated, Literal, get_args
 
 import mujoco
 import numpy as np
@@ -19,9 +19,9 @@ from ..models.errors import InputError, one_line, shortened
 from ..models.fields import Limits, check_fields, immutable
 from ..models.files import read_own_toml
 from ..models.fleet import load_vehicles, members_of
-from ..models.mjcf import level_data, swarm_spec
+from ..models.mjcf import swarm_spec
 from ..models.swarm import drone_names
-from ..models.vehicle import owners
+from ..models.vehicle import owners, radius_of
 from ..scenes import SceneConfig
 from ..scenes.build import SCENE_PREFIX, add_scene, move_geoms
 from ..scenes.marks import Mark, Point
@@ -56,28 +56,6 @@ _DISTANT = 40.0  # of a goal that no picture shows together with the craft
 _FAR = 10.0  # Cameras move back until craft and goal are as far apart, or as at the start
 
 
-class MetricValue(NamedTuple):
-    """A metric of a task, and its value."""
-
-    name: str
-    value: float
-    unit: str = ""
-    symbol: str = ""
-    """Short symbol; empty: the name."""
-
-    @property
-    def label(self) -> str:
-        """Its symbol, or its name."""
-        return self.symbol or self.name.replace("_", " ")
-
-    @property
-    def text(self) -> str:
-        """Value with four digits, and unit."""
-        whole = len(f"{abs(self.value):.0f}")
-        number = f"{self.value:.{max(4 - whole, 0)}f}" if self.unit else f"{self.value:.4g}"
-        return f"{number} {self.unit}".strip()
-
-
 @immutable
 class Moment:
     """One craft after one control step. Positions are in the world frame, m."""
@@ -92,8 +70,8 @@ class Moment:
     """Position to reach or hold; None if the task has no goal."""
     payload: Point | None = None
     """Position of what hangs below it on a cable; None if nothing does."""
-    metrics: tuple[MetricValue, ...] = ()
-    """The headline first."""
+    metrics: tuple[tuple[str, str], ...] = ()
+    """Names and values of the task's metrics for an overlay, the headline first."""
     marks: tuple[Mark, ...] = ()
     """What is to be seen of the task; where there is any, no disc is drawn at the goal."""
     readings: Sequence[Reading] = field(default=(), compare=False)
@@ -113,7 +91,7 @@ class Moment:
         thrusts = " ".join(f"{thrust:.3g}" for thrust in self.thrusts)
         rotors = len(self.thrusts)
         return [
-            *((metric.label, metric.text) for metric in self.metrics[:_MAX_METRICS]),
+            *self.metrics[:_MAX_METRICS],
             ("elevation", f"{self.position[2]:.2f} m"),
             (f"F1 to F{rotors}" if rotors > 1 else "F1", f"{thrusts} N"),
             ("reward", f"{self.reward:+.3f}"),
@@ -357,12 +335,9 @@ class Canvas(AbstractContextManager["Canvas"]):
 
 def _drawn_radius(model: MjModel) -> float:
     """Of a sphere about the body's origin that holds what is drawn of the largest craft, m."""
-    data = level_data(model)
     craft = owners(model)[model.geom_bodyid] >= 0
     drawn = craft & (model.geom_group <= 2)
-    chosen = drawn if drawn.any() else craft
-    reach = np.linalg.norm(data.geom_xpos, axis=1) + model.geom_rbound
-    return float(reach[chosen].max(initial=1e-3))
+    return radius_of(model, drawn if drawn.any() else craft)
 
 
 def scale_drawing(model: MjModel, radius: float, spread: float) -> None:

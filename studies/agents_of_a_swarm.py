@@ -69,7 +69,7 @@ class Row(Task):
     def setup(self) -> None:
         self.observation = (ArraySpec(name="observation", shape=(3,)),)
 
-    def begin(self, mask: np.ndarray, draw: Draw) -> InitialState:
+    def begin(self, draw: Draw) -> InitialState:
         row = 5.0 * np.arange(self.shape[1]) + draw.uniform(-0.1, 0.1)
         return InitialState(position=np.stack((row, 0.0 * row, 2.0 + 0.0 * row), axis=-1))
 

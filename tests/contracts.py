@@ -33,7 +33,6 @@ for name in ("Forest", "Warehouse", "Gates", "Dodge"):  # others keep their vehi
     TASKS.append(TASKS.pop(TASKS.index(f"rotorgram/{name}-v0")))
 HOVER = "rotorgram/Hover-v0"
 ELEVATION = "rotorgram/Elevation-v0"
-NOW = np.bool_(True)
 GOAL_OFFSET = ("goal - position x", "goal - position y", "goal - position z")
 on_both_tasks = pytest.mark.parametrize("env_id", [ELEVATION, HOVER])
 FILES = {"quad": QUAD_XML}

@@ -11,7 +11,7 @@ from imageio_ffmpeg import (  # type: ignore[import-untyped]
     get_ffmpeg_exe,
 )
 from PIL import Image
-from rotorgram.rendering import MetricValue, Moment
+from rotorgram.rendering import Moment
 
 WIDTH = 160
 HEIGHT = 120
@@ -30,7 +30,7 @@ def at(elevation: float, error: float = 0.0, *, goal: Any = True, **rest: Any) -
         "attitude": (1.0, 0.0, 0.0, 0.0),
         "thrusts": (49.0, 49.0, 49.0, 49.0),
         "goal": (0.0, 0.0, elevation + error) if goal is True else goal,
-        "metrics": (MetricValue("elevation_error", error, "m", "E"),),
+        "metrics": (("E", f"{error:.3f} m"),),
     }
     return Moment(**{**fields, **rest})
 

@@ -20,7 +20,7 @@ class Rise(Task):
     def setup(self):
         self.observation = (ArraySpec(name="observation", shape=(3,), low=-100.0, high=100.0),)
 
-    def begin(self, mask, draw):
+    def begin(self, draw):
         row = 5.0 * np.arange(self.shape[1]) + draw.uniform(-0.1, 0.1)
         return InitialState(position=np.stack((row, 0.0 * row, 10.0 + 0.0 * row), axis=-1))
 

@@ -8,11 +8,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ...sim import World
-from ...sim.state import Array, chosen, filled, pushed, taken
+from ...sim.state import ByName, chosen, filled, pushed, taken
 from ..spec import ArraySpec
 from .record import Record, Stage
-
-Values = np.ndarray
 
 
 @dataclass
@@ -29,14 +27,11 @@ class History(Stage):
 
     def step(self, record: Record) -> None:
         """A drone that begins fills its history with the present."""
-        past = vars(record).get("history", {})
-        history = {}
-        seen = {}
-        for name, values in record.observations.items():
-            history[name] = rows = later(past.get(name), values, self.steps, record)
-            seen[name] = rows.reshape(*record.shape, -1, *rows.shape[4:])
-        record.history = history
-        record.observations = seen
+        record.history = remembered(vars(record).get("history"), self.steps, record)
+        record.observations = {
+            name: rows.reshape(*record.shape, -1, *rows.shape[4:])
+            for name, rows in record.history.items()
+        }
 
 
 @dataclass
@@ -55,15 +50,10 @@ class ObservationDelay(Stage):
 
     def step(self, record: Record) -> None:
         """A drone that begins fills its past with the present."""
-        past = vars(record).get("past_observations", {})
+        past = vars(record).get("past_observations")
         age = self.world.parameters["observation_delay"]
-        sent = {}
-        arrived = {}
-        for name, values in record.observations.items():
-            sent[name] = later(past.get(name), values, self.longest + 1, record)
-            arrived[name] = taken(sent[name], age)
-        record.past_observations = sent
-        record.observations = arrived
+        record.past_observations = sent = remembered(past, self.longest + 1, record)
+        record.observations = {name: taken(values, age) for name, values in sent.items()}
 
 
 def with_history(array: ArraySpec, steps: int) -> ArraySpec:
@@ -86,11 +76,14 @@ def with_history(array: ArraySpec, steps: int) -> ArraySpec:
     )
 
 
-def later(past: Values | None, values: Values, steps: int, record: Record) -> Array:
-    """The past of `steps` steps, one step later; of drones that begin it is the present."""
-    if past is None:
-        return filled(values, steps)
-    new = pushed(past, values)
-    if record.begun is None:
-        return new
-    return chosen(record.begun, filled(values, steps), new)
+def remembered(past: ByName | None, steps: int, record: Record) -> ByName:
+    """The observations of `steps` steps, one step later; of drones that begin, the present ones."""
+    arrays = {}
+    for name, values in record.observations.items():
+        if past is None:
+            arrays[name] = filled(values, steps)
+            continue
+        arrays[name] = pushed(past[name], values)
+        if record.begun is not None:
+            arrays[name] = chosen(record.begun, filled(values, steps), arrays[name])
+    return arrays

@@ -29,18 +29,15 @@ class Starts(Stage):
         record.draw = self.world.draw(record.begun)
         memory = self.task.memory
         with memory.open("begin"):
-            start = self.task.begin(record.begun, record.draw)
+            start = self.task.begin(record.draw)
         memory.expand(record.shape)
         expected = (*record.shape, 3)
         got: object = type(start).__name__
         if isinstance(start, InitialState):
             got = tuple(getattr(start.position, "shape", ()))
         if got != expected:
-            env_id = self.task.config.env_id
-            raise InputError(
-                f"{env_id}: expected begin() to return an InitialState with a position of shape "
-                f"{expected}, got {got}"
-            )
+            wanted = f"begin() to return an InitialState with a position of shape {expected}"
+            refuse(self.task, wanted, got)
         record.start = start
 
 
@@ -91,28 +88,30 @@ class Judge(Stage):
         names = [array.name for array in task.observation]
         given = list(observations) if isinstance(observations, Mapping) else observations
         if not isinstance(observations, Mapping) or not observations.keys() >= set(names):
-            self._refuse(f"observe() to return a dict of {names}", given)
+            refuse(task, f"observe() to return a dict of {names}", given)
         count = prod(record.shape)
         for array in task.observation:
             shape = tuple(getattr(observations[array.name], "shape", ()))
             if prod(shape) != count * array.size:
                 expected = f"{array.name} of shape {array.shape} for each of {count} drones"
-                self._refuse(f"observe() to return {expected}", f"an array of shape {shape}")
+                refuse(task, f"observe() to return {expected}", f"an array of shape {shape}")
         if not isinstance(outcome, Outcome):
-            self._refuse("outcome() to return an Outcome", outcome)
+            refuse(task, "outcome() to return an Outcome", outcome)
         for metric in task.metrics:
             if metric.name not in outcome.metrics:
-                self._refuse(f"the metric {metric.name!r}", list(outcome.metrics))
+                refuse(task, f"the metric {metric.name!r}", list(outcome.metrics))
         if not any(np.ndim(term) for term in outcome.reward.values()):
             got = f"{outcome.reward}: make an array of it, as 1.0 + 0.0 * state.position[..., 2]"
-            self._refuse("a reward for each drone", got)
+            refuse(task, "a reward for each drone", got)
         kind = getattr(outcome.terminated, "dtype", type(outcome.terminated))
         if np.dtype(kind) != np.bool_:
-            self._refuse("terminated as truth values", outcome.terminated)
+            refuse(task, "terminated as truth values", outcome.terminated)
 
-    def _refuse(self, expected: str, got: object) -> NoReturn:
-        said = got if isinstance(got, str) else shortened(got)
-        raise InputError(f"{self.task.config.env_id}: expected {expected}, got {said}")
+
+def refuse(task: Task, expected: str, got: object) -> NoReturn:
+    """Raise `InputError` that names the task."""
+    said = got if isinstance(got, str) else shortened(got)
+    raise InputError(f"{task.config.env_id}: expected {expected}, got {said}")
 
 
 def _of_each(numbers: ByName, record: Record) -> ByName:

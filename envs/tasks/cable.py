@@ -149,11 +149,11 @@ class Cable(Swarm):
         missing = wanted - total(vehicle.allocation * even)
         return even + total(self._allocated * missing[..., None, :])
 
-    def begin(self, mask: Array, draw: Draw) -> InitialState:
+    def begin(self, draw: Draw) -> InitialState:
         """At rest in equilibrium, the payload off its goal."""
         away = self.options.start_band * self.gap
         self.memory.turn = turn = shared(draw.uniform(-math.pi, math.pi))
-        ball = np.array(self.options.center) + shared(draw.uniform(-away, away, (3,)))
+        ball = self.center + shared(draw.uniform(-away, away, (3,)))
         azimuth = turn + self._azimuths
         half = self._tilt / 2
         sine = sin(half)
@@ -170,7 +170,7 @@ class Cable(Swarm):
 
     def goal(self, state: State) -> Array:
         """The place of each drone where the payload hangs still at its goal."""
-        return np.array(self.options.center) + self._around(self.memory.turn)
+        return self.center + self._around(self.memory.turn)
 
     def further(self, state: State) -> list[Array]:
         """The payload from the drone, its way to its goal, and the neighbours."""
@@ -180,7 +180,7 @@ class Cable(Swarm):
 
     def _missing(self, state: State) -> Array:
         """From the payload to its goal, world frame, m, (W, A, 3)."""
-        return np.array(self.options.center) - state.payload
+        return self.center - state.payload
 
     def ended(self, state: State) -> Array:
         """Whether the flight of all drones of a world is over, bool, (W, A)."""

@@ -7,7 +7,7 @@ import numpy as np
 
 from ...models.fields import immutable
 from ...scenes import SceneConfig
-from ...sim import Array, Draw, InitialState, exp
+from ...sim import Draw, InitialState, exp
 from ..state import State
 from .goal import Distance, Point, Tilt
 from .hover import Hover, HoverOptions
@@ -76,10 +76,10 @@ class Dodge(Hover):
         """New throws in each episode."""
         return SceneConfig(name="traffic", layouts="new")
 
-    def begin(self, mask: Array, draw: Draw) -> InitialState:
+    def begin(self, draw: Draw) -> InitialState:
         """See the class."""
         begin_measures(self)
-        return super().begin(mask, draw)
+        return super().begin(draw)
 
     def update_memory(self, state: State) -> None:
         """Measure the step."""

@@ -7,18 +7,11 @@ import numpy as np
 
 from ...models.errors import InputError, shortened
 from ...models.fields import Limits, NumberOrPair, immutable
-from ...sim import (
-    Array,
-    CollectiveThrust,
-    Draw,
-    InitialState,
-    clip,
-    stack,
-)  # fmt: skip
-from ..spec import ArraySpec, Metric
+from ...sim import Array, CollectiveThrust, Draw, InitialState, clip, stack
+from ..spec import Metric
 from ..state import State
-from .goal import AIR, Number, NumberOrRange, array_of, check_more, ends_of, nearness
-from .task import Outcome, Task, TaskOptions
+from .goal import AIR, Number, NumberOrRange, NumbersTask, check_band, ends_of, nearness
+from .task import Outcome, TaskOptions
 
 TERMINATION_REWARD = -20.0
 """Added to the reward of the step that terminates an episode (crash, flip-over, out of band)."""
@@ -34,7 +27,7 @@ Observed = Literal["full", "error"]
 class ElevationOptions(TaskOptions):
     """Options of `rotorgram/Elevation-v0`."""
 
-    target: Annotated[NumberOrRange, NumberOrPair(Limits(unit="m"))] = 5.0
+    target: Annotated[NumberOrRange, NumberOrPair(unit="m")] = 5.0
     """Target elevation Y, m: a number, or (low, high) to draw one uniformly for each episode."""
     start_band: Annotated[float, Limits(0.0, FURTHEST, "m")] = 1.0
     """An episode starts at rest, hovering, up to this far above or below the target, m."""
@@ -50,10 +43,10 @@ class ElevationOptions(TaskOptions):
 
     def check(self) -> None:
         """Check the options of this task. Raises `InputError`."""
-        check_more("flight_band", self.flight_band, "start_band", self.start_band)
+        check_band(self.flight_band, "start_band", self.start_band)
 
 
-class Elevation(Task):
+class Elevation(NumbersTask):
     """Hold a craft at a target elevation by changing the thrust of all rotors alike.
 
     The task of "Drone Elevation Control Based on Python-Unity Integrated Framework for
@@ -133,11 +126,9 @@ class Elevation(Task):
             discrete=options.action_type == "discrete",
         )
         self._hover = float(vehicle.hover_thrust[0])
-        spec = self._observation_spec()
-        self.observation = (spec,)
-        self._bounds = spec.bounds()
+        self.define_numbers(self._numbers(), "world, up")
 
-    def begin(self, mask: Array, draw: Draw) -> InitialState:
+    def begin(self, draw: Draw) -> InitialState:
         """Level, at rest, near the target."""
         band = self.options.start_band
         target = draw.uniform(*ends_of(self.options.target))
@@ -191,7 +182,8 @@ class Elevation(Task):
         """Largest |E| of an observation, m: the band and one control period of flight."""
         return float(self.options.flight_band + self.rate_bound * self.control_period)
 
-    def _observation_spec(self) -> ArraySpec:
+    def _numbers(self) -> list[Number]:
+        """Of the observation, with their bounds."""
         least = self.vehicle.thrust_low[0] / self._hover - 1
         most = self.vehicle.thrust_high[0] / self._hover - 1
         lows = np.array((-self.error_bound, -self.rate_bound, least), np.float32)
@@ -203,4 +195,4 @@ class Elevation(Task):
         high = np.nextafter(highs, outwards).tolist()
         names = ("elevation error", "rate of the error", "thrust over hover")
         rows = zip(names, ("m", "m/s", "1"), low, high, strict=True)
-        return array_of([Number(*row) for row in rows][:size], "world, up")
+        return [Number(*row) for row in rows][:size]

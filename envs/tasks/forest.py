@@ -29,12 +29,12 @@ from .goal import (
     MAX_SPEED,
     Number,
     NumberOrRange,
+    NumbersTask,
     along,
-    array_of,
     ends_of,
 )
 from .measures import METRICS, begin_measures, measures_of, update_measures
-from .task import Outcome, Task, TaskOptions
+from .task import Outcome, TaskOptions
 
 AISLE = 2.0
 """From the ends of the wood to start and goal, m."""
@@ -57,7 +57,7 @@ class ForestOptions(TaskOptions):
 
     density: Annotated[float, Limits(1e-3, 0.5, "1/m²")] = 0.1
     """Trees per square metre."""
-    speed: Annotated[NumberOrRange, NumberOrPair(Limits(0.5, 20.0, "m/s"))] = 3.0
+    speed: Annotated[NumberOrRange, NumberOrPair(0.5, 20.0, "m/s")] = 3.0
     """Wanted speed, m/s; of a pair, each episode draws one between."""
     way: Annotated[float, Limits(*_WAY, "m")] = 30.0
     """From start to goal, m."""
@@ -67,7 +67,7 @@ class ForestOptions(TaskOptions):
     """Whether a critic sees `distances`."""
 
 
-class Forest(Task):
+class Forest(NumbersTask):
     """Fly through a wood that was never seen to a goal behind it.
 
     ## Observation
@@ -165,11 +165,9 @@ class Forest(Task):
         ]
         for name in self.controller.components:
             numbers.append(Number(f"last {name}", "1", -1.0, 1.0))
-        array = array_of(numbers, "world turned by the heading; body rates: body")
-        self.observation = (array,)
-        self._bounds = array.bounds()
+        self.define_numbers(numbers, "world turned by the heading; body rates: body")
 
-    def begin(self, mask: Array, draw: Draw) -> InitialState:
+    def begin(self, draw: Draw) -> InitialState:
         """At rest before what is to be crossed, looking at the goal."""
         height = draw.uniform(*self.heights, (2,))
         memory = self.memory
@@ -178,7 +176,7 @@ class Forest(Task):
         memory.way = 2 * self._half
         memory.progress = memory.change = 0.0
         begin_measures(self)
-        memory.last = np.zeros_like(height, shape=(*mask.shape, len(self.controller.components)))
+        memory.last = np.zeros_like(height, shape=(*self.shape, len(self.controller.components)))
         return InitialState(position=stack((-self._half, 0.0, height[..., 0])))
 
     def goal(self, state: State) -> Array:

@@ -96,7 +96,7 @@ class Gates(Racing):
         """That of the episode's layout, (W, A, 8, 6)."""
         return self.memory.track
 
-    def begin(self, mask: Array, draw: Draw) -> InitialState:
+    def begin(self, draw: Draw) -> InitialState:
         """At rest before the first gate, the nose towards it."""
         offset = self.offset(draw)
         track = draw.openings + 0.0 * offset[..., None, :1]

@@ -107,7 +107,26 @@ def with_payload(config: EnvConfig, mass: float, cable: float) -> EnvConfig:
     return replace(config, effects=replace(config.effects, payload=mass, cable=cable))
 
 
-class GoalTask(Task):
+class NumbersTask(Task):
+    """Base of tasks that observe one row of numbers, which they keep within its bounds."""
+
+    def define_numbers(self, numbers: Sequence[Number], frame: str) -> None:
+        """Set `observation` and its bounds."""
+        names, units, lows, highs = zip(*numbers, strict=True)
+        array = ArraySpec(
+            name="observation",
+            shape=(len(numbers),),
+            low=lows,
+            high=highs,
+            unit=units,
+            frame=frame,
+            components=names,
+        )
+        self.observation = (array,)
+        self._bounds = array.bounds()
+
+
+class GoalTask(NumbersTask):
     """Base of tasks that are flown to a goal, with an observation of 15 + R numbers and more.
 
     Goal minus position, m; velocity, m/s; the directions of body x, the nose, and of body z, the
@@ -143,9 +162,7 @@ class GoalTask(Task):
             numbers.append(Number(f"thrust {rotor} over hover", "1", low, high))
         numbers += further
         frame = "body" if self.body else "world turned by the wanted heading; body rates: body"
-        array = array_of(numbers, frame)
-        self.observation = (array,)
-        self._bounds = array.bounds()
+        self.define_numbers(numbers, frame)
 
     def observe(self, state: State) -> dict[str, Array]:
         """See the table of the class; further numbers are those of `further`."""
@@ -240,20 +257,6 @@ def ends_of(range_: NumberOrRange) -> tuple[float, float]:
     return range_ if isinstance(range_, tuple) else (range_, range_)
 
 
-def array_of(numbers: Sequence[Number], frame: str) -> ArraySpec:
-    """The spec of an observation of some numbers."""
-    names, units, lows, highs = zip(*numbers, strict=True)
-    return ArraySpec(
-        name="observation",
-        shape=(len(numbers),),
-        low=lows,
-        high=highs,
-        unit=units,
-        frame=frame,
-        components=names,
-    )
-
-
 def along(name: str, unit: str, size: float, axes: str = "xyz") -> list[Number]:
     """A vector of an observation, none of whose numbers is larger than `size`."""
     return [Number(f"{name} {axis}", unit, -size, size) for axis in axes]
@@ -289,15 +292,17 @@ def check_room(task: Task, reach: float) -> None:
         )
 
 
-def check_more(name: str, size: float, what: str, least: float) -> None:
-    """Refuse an option, m, that is no larger than something. Raises `InputError`."""
-    if size <= least:
-        raise InputError(f"{name}: expected more than {what} = {least:.4g} m, got {size!r}")
+def check_band(flight_band: float, what: str, least: float) -> None:
+    """Refuse a band, m, that is no larger than something. Raises `InputError`."""
+    if flight_band <= least:
+        raise InputError(
+            f"flight_band: expected more than {what} = {least:.4g} m, got {flight_band!r}"
+        )
 
 
-def check_band(flight_band: float, start_band: float) -> None:
+def check_cube(flight_band: float, start_band: float) -> None:
     """Refuse a band that a start within a cube leaves. Raises `InputError`."""
-    check_more("flight_band", flight_band, "sqrt(3) · start_band", start_band * math.sqrt(3))
+    check_band(flight_band, "sqrt(3) · start_band", start_band * math.sqrt(3))
 
 
 def row_of(rows: Array, index: Array) -> Array:

@@ -4,18 +4,7 @@ import math
 from typing import Annotated, ClassVar
 
 from ...models.fields import Limits, immutable
-from ...sim import (
-    Array,
-    Draw,
-    InitialState,
-    atan2,
-    body_x,
-    cos,
-    parts_of,
-    sin,
-    stack,
-    wrapped,
-)  # fmt: skip
+from ...sim import Draw, InitialState, atan2, body_x, cos, parts_of, sin, stack, wrapped
 from ..spec import Metric
 from ..state import State
 from .goal import (
@@ -28,7 +17,7 @@ from .goal import (
     Point,
     Tilt,
     at,
-    check_band,
+    check_cube,
     check_height,
     nearness,
 )
@@ -56,7 +45,7 @@ class HoverOptions(TaskOptions):
 
     def check(self) -> None:
         """Check the options of this task. Raises `InputError`."""
-        check_band(self.flight_band, self.start_band)
+        check_cube(self.flight_band, self.start_band)
 
 
 class Hover(GoalTask):
@@ -104,7 +93,7 @@ class Hover(GoalTask):
         self.wanted = math.radians(options.heading)
         self.define_observation(options.flight_band)
 
-    def begin(self, mask: Array, draw: Draw) -> InitialState:
+    def begin(self, draw: Draw) -> InitialState:
         """At rest near the goal, tilted and turned."""
         options = self.options
         offset = self.offset(draw)

@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 import numpy as np
 
 from ...models.errors import InputError, shortened
-from ...models.fields import Limits, NumberOrPair, immutable
+from ...models.fields import NumberOrPair, immutable
 from ...sim import Array, Draw, InitialState, cos, length, sin, stack
 from ..spec import Mark, Metric
 from ..state import State
@@ -20,7 +20,7 @@ from .goal import (
     SlowSpeed,
     Upright,
     along,
-    check_more,
+    check_band,
     check_room,
     ends_of,
     rates_cost,
@@ -43,7 +43,7 @@ class LandingOptions(TaskOptions):
     """Path of the pad about (0, 0): a `circle`, or a `line` on which it swings to and fro."""
     pad_path: Size = 2.0
     """Radius of the circle, or half the length of the line, m."""
-    pad_speed: Annotated[NumberOrRange, NumberOrPair(Limits(0.0, FASTEST_PAD, "m/s"))] = (0.0, 1.0)
+    pad_speed: Annotated[NumberOrRange, NumberOrPair(0.0, FASTEST_PAD, "m/s")] = (0.0, 1.0)
     """Speed of the pad, m/s, on a line the largest: a number, or (low, high) to draw one uniformly
     for each episode."""
     pad_radius: Size = 0.5
@@ -70,7 +70,7 @@ class LandingOptions(TaskOptions):
             )
         reach = self.pad_path + math.sqrt(2) * self.start_band
         furthest = length(np.array((reach, self.start_height + self.start_band)))
-        check_more("flight_band", self.flight_band, "the furthest start", furthest)
+        check_band(self.flight_band, "the furthest start", furthest)
 
 
 class Landing(GoalTask):
@@ -144,7 +144,7 @@ class Landing(GoalTask):
         below = (0.0, 0.0, -self._height)
         self.marks = (Mark(shape="disc", size=options.pad_radius, position=below, moves=True),)
 
-    def begin(self, mask: Array, draw: Draw) -> InitialState:
+    def begin(self, draw: Draw) -> InitialState:
         """Level and at rest above the pad's path."""
         options = self.options
         offset = self.offset(draw)

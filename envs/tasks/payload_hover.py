@@ -4,14 +4,7 @@ import math
 from typing import Annotated
 
 from ...models.fields import Limits, immutable
-from ...sim import (
-    Array,
-    Draw,
-    InitialState,
-    atan2,
-    length,
-    stack,
-)
+from ...sim import Array, Draw, InitialState, atan2, length, stack
 from ..config import EnvConfig
 from ..spec import Metric
 from ..state import State
@@ -28,7 +21,7 @@ from .goal import (
     Tilt,
     along,
     at,
-    check_band,
+    check_cube,
     check_height,
     nearness,
     swing_cost,
@@ -58,7 +51,7 @@ class PayloadHoverOptions(TaskOptions):
 
     def check(self) -> None:
         """Check the options of this task. Raises `InputError`."""
-        check_band(self.flight_band, self.start_band)
+        check_cube(self.flight_band, self.start_band)
 
 
 class PayloadHover(GoalTask):
@@ -99,10 +92,7 @@ class PayloadHover(GoalTask):
 
     Options = PayloadHoverOptions
     worst_step = -1.0 + WORST_SWING + WORST_RATES
-    metrics = (
-        PAYLOAD_ERROR,
-        Metric(name="swing", unit="deg", settled=5.0),
-    )
+    metrics = (PAYLOAD_ERROR, Metric(name="swing", unit="deg", settled=5.0))
 
     def setup(self) -> None:
         """See the class."""
@@ -120,7 +110,7 @@ class PayloadHover(GoalTask):
         mass = self.options.payload_share * self.vehicle.mass
         return with_payload(config, mass, self.options.cable)
 
-    def begin(self, mask: Array, draw: Draw) -> InitialState:
+    def begin(self, draw: Draw) -> InitialState:
         """The payload near its goal, hanging still below a craft that moves and tilts."""
         options = self.options
         fastest = options.start_speed

@@ -10,7 +10,7 @@ from typing import Annotated, ClassVar
 import numpy as np
 
 from ...models.errors import InputError, one_line, shortened
-from ...models.fields import Limits, immutable, read_table
+from ...models.fields import Limits, immutable, read_table, set_fields
 from ...sim import (
     Array,
     Draw,
@@ -97,7 +97,7 @@ class RacingOptions(TaskOptions):
         """Check the options of this task. Raises `InputError`."""
         gates, start = read_track(self.track)
         content = {"gates": [asdict(gate) for gate in gates], "start": asdict(start)}
-        object.__setattr__(self, "track", json.dumps(content, separators=(",", ":")))
+        set_fields(self, track=json.dumps(content, separators=(",", ":")))
 
 
 class Racing(GoalTask):
@@ -185,7 +185,7 @@ class Racing(GoalTask):
         """Gates: their centers, x and y of their directions, half their sizes, (..., count, 6)."""
         return self._gates
 
-    def begin(self, mask: Array, draw: Draw) -> InitialState:
+    def begin(self, draw: Draw) -> InitialState:
         """At rest near the start, the nose along the track."""
         offset = self.offset(draw)
         position = np.array(self._start.position) + offset

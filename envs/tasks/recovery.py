@@ -6,16 +6,7 @@ from typing import Annotated, Literal
 import numpy as np
 
 from ...models.fields import Limits, immutable
-from ...sim import (
-    Array,
-    Draw,
-    InitialState,
-    cos,
-    length,
-    sin,
-    square_root,
-    stack,
-)
+from ...sim import Array, Draw, InitialState, cos, length, sin, square_root, stack
 from ..spec import Metric
 from ..state import State
 from .goal import (
@@ -27,8 +18,8 @@ from .goal import (
     Speed,
     Upright,
     at,
+    check_band,
     check_height,
-    check_more,
     nearness,
 )
 from .task import Outcome, TaskOptions
@@ -64,7 +55,7 @@ class RecoveryOptions(TaskOptions):
 
     def check(self) -> None:
         """Check the options of this task. Raises `InputError`."""
-        check_more("flight_band", self.flight_band, "near", self.near)
+        check_band(self.flight_band, "near", self.near)
 
 
 class Recovery(GoalTask):
@@ -134,7 +125,7 @@ class Recovery(GoalTask):
         self.define_observation(options.flight_band)
         self._least_upright = cos(math.radians(options.upright))
 
-    def begin(self, mask: Array, draw: Draw) -> InitialState:
+    def begin(self, draw: Draw) -> InitialState:
         """At the goal, thrown."""
         options = self.options
         turn = math.pi

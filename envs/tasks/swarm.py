@@ -70,10 +70,7 @@ class Swarm(GoalTask):
     `goal`.
     """
 
-    metrics = (
-        POSITION_ERROR,
-        Metric(name="clearance", unit="m", goal="high"),
-    )
+    metrics = (POSITION_ERROR, Metric(name="clearance", unit="m", goal="high"))
     min_drones = 2
     max_drones = MAX_DRONES
     has_radio = True
@@ -115,6 +112,11 @@ class Swarm(GoalTask):
         return self.shape[1]
 
     @property
+    def center(self) -> Array:
+        """Middle of starts and goals: world frame, m, shape (3,)."""
+        return np.array(self.options.center)
+
+    @property
     def gap(self) -> float:
         """Distance between neighbouring starts, and goals, m."""
         spacing: float = self.options.spacing
@@ -128,7 +130,7 @@ class Swarm(GoalTask):
         lots = draw.uniform(0.0, 1.0)
         places = np.argsort(lots, axis=-1, kind="stable").astype(float)
         cells = looked_up(grid(self.count), places) * self.gap
-        return jitter + np.array(self.options.center) + cells
+        return jitter + self.center + cells
 
     def further(self, state: State) -> list[Array]:
         """The numbers of the neighbours, shape (W, A, 7 k) in all."""
@@ -174,7 +176,7 @@ class Swarm(GoalTask):
 
     def goal(self, state: State) -> Array:
         """The slot of each drone."""
-        return np.array(self.options.center) + self._slots + 0.0 * state.position
+        return self.center + self._slots + 0.0 * state.position
 
 
 def approach(way: Array, velocity: Array) -> Array:
@@ -263,7 +265,7 @@ class Formation(Swarm):
         """See the class."""
         self.prepare_slots(_PLACES[self.options.formation](self.count))
 
-    def begin(self, mask: Array, draw: Draw) -> InitialState:
+    def begin(self, draw: Draw) -> InitialState:
         """At rest, level, in the cells of a grid by lot."""
         return InitialState(position=self.cells(draw))
 
@@ -311,7 +313,7 @@ class Crossing(Swarm):
         self.reach = 2 * self._radius + 2 * JITTER * self.gap
         self.prepare()
 
-    def begin(self, mask: Array, draw: Draw) -> InitialState:
+    def begin(self, draw: Draw) -> InitialState:
         """At rest, level, on the ring."""
         self.memory.turn = turn = shared(draw.uniform(-math.pi, math.pi))
         jitter = draw.uniform(-JITTER, JITTER, (3,)) * self.gap
@@ -321,7 +323,7 @@ class Crossing(Swarm):
     def _opposite(self, turn: Array) -> Array:
         """Where drones fly to from a ring turned by an angle, rad: world frame, m, (W, A, 3)."""
         angle = turn + self._angles + math.pi
-        return np.array(self.options.center) + on_circle(angle, self._radius)
+        return self.center + on_circle(angle, self._radius)
 
     def goal(self, state: State) -> Array:
         """The place opposite to the start of each drone."""
@@ -385,7 +387,7 @@ class Escort(Swarm):
         velocity = along("target velocity", "m/s", MAX_SPEED)
         self.prepare_slots(ring(self.count), velocity)
 
-    def begin(self, mask: Array, draw: Draw) -> InitialState:
+    def begin(self, draw: Draw) -> InitialState:
         """At rest, level, in the cells of a grid about the target, by lot."""
         memory = self.memory
         memory.ratio = shared(draw.uniform(0.5, 2.0))

@@ -173,11 +173,10 @@ class Task(ABC):
         """
 
     @abstractmethod
-    def begin(self, mask: Array, draw: Draw) -> InitialState:
+    def begin(self, draw: Draw) -> InitialState:
         """Begin episodes: draw their numbers, shape (W, A, ...), and return the drones' starts.
 
-        The mask, bool, shape (W, A), has the drones that begin one. Give numbers for all: starts
-        and memory of the others are kept.
+        Give numbers for all drones: those that begin no episode keep their state and memory.
         """
 
     def update_memory(self, state: State) -> None:  # noqa: B027  # optional

@@ -112,7 +112,7 @@ class Tracking(GoalTask):
             self._ahead.append(float(round(ahead / step)))
         self.define_observation(reach / 2, numbers)
 
-    def begin(self, mask: Array, draw: Draw) -> InitialState:
+    def begin(self, draw: Draw) -> InitialState:
         """Near any point of the trajectory, at its velocity."""
         share = draw.uniform(0.0, 1.0)
         self.memory.index = np.floor(share * len(self._table))  # row of the table

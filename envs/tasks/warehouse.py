@@ -25,7 +25,7 @@ _SAID = 1.0
 class WarehouseOptions(TaskOptions):
     """Options of `rotorgram/Warehouse-v0`."""
 
-    speed: Annotated[NumberOrRange, NumberOrPair(Limits(0.3, 5.0, "m/s"))] = 1.2
+    speed: Annotated[NumberOrRange, NumberOrPair(0.3, 5.0, "m/s")] = 1.2
     """Wanted speed, m/s; of a pair, each episode draws one between."""
     rows: Annotated[int, Limits(1, 8, whole=True)] = 2
     """Of racks, one after the other."""
@@ -104,9 +104,9 @@ class Warehouse(Forest):
         )
         self.observation = (*self.observation, order)
 
-    def begin(self, mask: Array, draw: Draw) -> InitialState:
+    def begin(self, draw: Draw) -> InitialState:
         """Before the first row, looking at the goal."""
-        start = super().begin(mask, draw)
+        start = super().begin(draw)
         memory = self.memory
         # x and y of the middles of the open aisles, m.
         memory.doors = draw.openings[..., :2] + 0.0 * start.position[..., None, :1]

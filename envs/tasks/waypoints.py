@@ -99,7 +99,7 @@ class Waypoints(GoalTask):
         furthest = 2 * length(np.array(self._sides))
         self.define_observation(furthest / 2, along("point after - position", "m", furthest))
 
-    def begin(self, mask: Array, draw: Draw) -> InitialState:
+    def begin(self, draw: Draw) -> InitialState:
         """At rest, level, somewhere in the box; the points are drawn alike."""
         options = self.options
         center = np.array(options.center)

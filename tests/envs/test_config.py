@@ -35,7 +35,7 @@ class Hold(Task):
     def setup(self) -> None:
         self.observation = (ArraySpec(name="observation", shape=(1,)),)
 
-    def begin(self, mask: Any, draw: Any) -> InitialState:
+    def begin(self, draw: Any) -> InitialState:
         return InitialState(position=stack((0.0, 0.0, 5.0 + 0.0 * draw.uniform(0.0, 1.0))))
 
     def observe(self, state: Any) -> dict[str, Any]:

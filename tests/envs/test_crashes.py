@@ -68,7 +68,7 @@ def test_contact_and_a_tilt_above_90_degrees_end_a_flight(
 ) -> None:
     task = task_of(f"rotorgram/{name}-v0")
     loads = {"payload": (0.0, 0.0, 4.0), "payload_velocity": (0.0, 0.0, 0.0)}
-    task.begin(np.bool_(True), Shares(*[0.5] * 7))
+    task.begin(Shares(*[0.5] * 7))
     place = task.place(state_of(**loads)) + np.array((0.0, 0.0, 0.5))
     outcome = task.outcome(state_of(**{"position": place, **loads, **change}))
     assert bool(outcome.terminated) == crashed

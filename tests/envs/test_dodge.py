@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-from contracts import NOW
 from rotorgram.envs import Loop
 from rotorgram.envs.config import EnvConfig
 
@@ -57,7 +56,7 @@ def test_where_nothing_comes_it_succeeds() -> None:
 def test_speeds_and_clearance_by_hand() -> None:
     """Steps of 0.04 s at 5 m/s and at 1 m/s, 0.4 m and 0.7 m off, the second touching."""
     task = task_of(DODGE)
-    task.begin(NOW, Shares((0.5, 0.5, 0.5), 0.0, 0.5, 0.5))
+    task.begin(Shares((0.5, 0.5, 0.5), 0.0, 0.5, 0.5))
     at_goal = {"position": (0.0, 0.0, 2.0)}
     first = state_of(**at_goal, velocity=(3.0, 0.0, 4.0), known_clearance=0.4, time=0.04)
     task.update_memory(first)

@@ -58,8 +58,8 @@ class Flight:
 
     def __init__(self, start: float, target: float = 5.0, **options: Any) -> None:
         class Placed(Elevation):
-            def begin(self, mask: Any, draw: Any) -> InitialState:
-                super().begin(mask, draw)
+            def begin(self, draw: Any) -> InitialState:
+                super().begin(draw)
                 return InitialState(position=stack((0.0, 0.0, np.array([[start]]))))
 
         register("env/Placed-v0", Placed)

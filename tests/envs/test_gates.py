@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from contracts import NOW, loop_of
+from contracts import loop_of
 from rotorgram.models import InputError
 from rotorgram.scenes import SceneConfig, Solids
 from rotorgram.scenes.generators import drafted
@@ -21,7 +21,7 @@ def begun(**options: Any) -> Any:
     task = task_of(GATES, **options)
     shares = Shares((0.5, 0.5, 0.5))
     shares.openings = TRACK
-    return task, task.begin(NOW, shares)
+    return task, task.begin(shares)
 
 
 def left(task: Any, *position: float) -> float:

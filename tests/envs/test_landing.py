@@ -6,7 +6,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
-from contracts import GOAL_OFFSET, NOW, TABLES, observed, rows_of
+from contracts import GOAL_OFFSET, TABLES, observed, rows_of
 from pilot import Pilot, fly, limited
 from rotorgram.models import Vehicle
 
@@ -20,7 +20,7 @@ MIDDLE = (0.5, 0.5, 0.5)  # of the start's band
 def begun(direction: float = 0.5, phase: float = 0.5, side: float = 1.0, **options: Any) -> Any:
     """A task whose pad begins at these shares of its draws, at its largest speed."""
     task = task_of(ID, **options)
-    task.begin(NOW, Shares(MIDDLE, 1.0, direction, phase, side))
+    task.begin(Shares(MIDDLE, 1.0, direction, phase, side))
     return task
 
 
@@ -32,7 +32,7 @@ def moved(task: Any, steps: int, **state: Any) -> Any:
 
 def test_a_start_is_above_the_middle_of_the_path() -> None:
     shares = Shares((0.0, 0.5, 1.0), 0.5, 0.5, 0.5, 0.5)
-    pose = task_of(ID).begin(NOW, shares)
+    pose = task_of(ID).begin(shares)
     assert pose.position == pytest.approx([-1.0, 0.0, REST + 5.0])
     assert pose.velocity is None
     assert pose.quaternion is None

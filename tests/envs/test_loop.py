@@ -56,10 +56,10 @@ def test_a_first_reset_that_is_refused_begins_nothing() -> None:
     refusals = [InputError("start: expected another one")]
 
     class Refusing(registry.task_type(ID)):  # type: ignore[misc]
-        def begin(self, mask: Any, draw: Any) -> Any:
+        def begin(self, draw: Any) -> Any:
             if refusals:
                 raise refusals.pop()
-            return super().begin(mask, draw)
+            return super().begin(draw)
 
     register("Refusing-v0", Refusing)
     loop = loop_of("Refusing-v0", 2)
@@ -126,7 +126,7 @@ class Careless(Task):
         picture = ArraySpec(name="picture", shape=(2, 2), dtype="uint8")
         self.observation = (position, picture)
 
-    def begin(self, mask: Any, draw: Any) -> InitialState:
+    def begin(self, draw: Any) -> InitialState:
         return InitialState(position=stack((0.0, 0.0, draw.uniform(3.0, 4.0))))
 
     def observe(self, state: Any) -> dict[str, Any]:
@@ -141,9 +141,9 @@ class Careless(Task):
 class Counting(Careless):
     """Counts the steps of an episode, in its memory."""
 
-    def begin(self, mask: Any, draw: Any) -> InitialState:
+    def begin(self, draw: Any) -> InitialState:
         self.memory.count = 0.0
-        return super().begin(mask, draw)
+        return super().begin(draw)
 
     def update_memory(self, state: Any) -> None:
         self.memory.count = self.memory.count + 1.0
@@ -215,8 +215,8 @@ def test_what_a_step_gave_stays_as_it_was(careless: str, num_envs: int) -> None:
 @one_or_several
 def test_a_task_may_give_constants_and_float32(num_envs: int) -> None:
     class Plain(registry.task_type(ID)):  # type: ignore[misc]
-        def begin(self, mask: Any, draw: Any) -> InitialState:
-            super().begin(mask, draw)
+        def begin(self, draw: Any) -> InitialState:
+            super().begin(draw)
             return InitialState(position=stack((0.0, 0.0, 4.5 + 0.0 * self.memory.target)))
 
         def outcome(self, state: Any) -> Any:
@@ -323,7 +323,7 @@ def test_numbers_of_a_task_that_are_not_finite_go_no_further(num_envs: int, wron
 )
 def test_a_start_that_is_none(num_envs: int, start: Any, got: str) -> None:
     class Lost(registry.task_type(ID)):  # type: ignore[misc]
-        def begin(self, mask: Any, draw: Any) -> Any:
+        def begin(self, draw: Any) -> Any:
             return start
 
     register("Lost-v0", Lost)

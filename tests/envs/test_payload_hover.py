@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from contracts import (
     GOAL_OFFSET,
-    NOW,
     TABLES,
     check_outcome,
     everyone,
@@ -31,7 +30,7 @@ AT_GOAL = {"payload": (0.0, 0.0, 4.0), "payload_velocity": (0.0, 0.0, 0.0)}  # t
 def test_a_start_by_hand() -> None:
     """Tilted by 7.5° about y, moving along -x, at the thrust that carries 20 kg and 2 kg."""
     shares = Shares((1.0, 0.5, 0.0), 0.5, 0.75, 0.0, 0.5)
-    pose = task_of(ID).begin(NOW, shares)
+    pose = task_of(ID).begin(shares)
     assert pose.position == pytest.approx([1.0, 0.0, 4.0])
     assert pose.quaternion == pytest.approx(about((0, 1, 0), 7.5), abs=1e-12)
     assert pose.velocity == pytest.approx([-1.0, 0.0, 0.0])

@@ -8,7 +8,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
-from contracts import GOAL_OFFSET, NOW, TABLES, observed, rows_of
+from contracts import GOAL_OFFSET, TABLES, observed, rows_of
 from pilot import Pilot, fly, limited
 from rotorgram.models import Vehicle
 from rotorgram.models.errors import InputError
@@ -22,7 +22,7 @@ TRACK = json.dumps(TABLES["racing: TRACK"])
 
 def begun(**options: Any) -> Any:
     task = task_of(ID, **{"track": TRACK, **options})
-    task.begin(NOW, Shares((0.5, 0.5, 0.5)))
+    task.begin(Shares((0.5, 0.5, 0.5)))
     return task
 
 
@@ -34,7 +34,7 @@ def moved(task: Any, *position: float, **rest: Any) -> Any:
 
 def test_a_start_by_hand() -> None:
     task = task_of(ID, track=TRACK, start_band=2.0)
-    pose = task.begin(NOW, Shares((1.0, 0.0, 0.5)))
+    pose = task.begin(Shares((1.0, 0.0, 0.5)))
     assert pose.position.tolist() == [2.0, -2.0, 5.0]
     root = math.sqrt(0.5)
     assert pose.quaternion == pytest.approx([root, 0.0, 0.0, root])

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from bounds import least_height_lost, recovery_bounds
 from contracts import (
-    NOW,
     TABLES,
     check_outcome,
     everyone,
@@ -33,7 +32,7 @@ LARGE = 1.95 / math.sqrt(COUNT)  # distance of Kolmogorov and Smirnov that one i
 
 def begun(**options: Any) -> Any:
     task = task_of(ID, **options)
-    task.begin(NOW, Shares(*[0.5] * 7))
+    task.begin(Shares(*[0.5] * 7))
     return task
 
 
@@ -41,7 +40,7 @@ def test_a_start_by_hand() -> None:
     """The quaternion of Shoemake for (1/4, a = 90°, b = 180°), thrown up and along y."""
     task = task_of(ID, goal=(1.0, 2.0, 30.0))
     shares = Shares(0.25, 0.75, 1.0, 1.0, 0.8, 0.75, (1.0, 0.5, 0.0))
-    pose = task.begin(NOW, shares)
+    pose = task.begin(shares)
     assert pose.position.tolist() == [1.0, 2.0, 30.0]
     root = math.sqrt(0.75)
     assert pose.quaternion == pytest.approx([-0.5, root, 0.0, 0.0], abs=1e-12)
@@ -183,7 +182,7 @@ def test_time_and_height_lost_by_hand() -> None:
         told.append(row)
     expected = TABLES["recovery: time and height lost by hand, expected"]
     np.testing.assert_allclose(told, expected, atol=1e-12)
-    task.begin(NOW, Shares(*[0.5] * 7))
+    task.begin(Shares(*[0.5] * 7))
     metrics = task.outcome(state_of(**PLACE)).metrics
     assert metrics["recovery_time"] == 0.0
     assert metrics["height_lost"] == 0.0

@@ -18,17 +18,16 @@ OPTIONS = {env_id: registry.task_type(env_id).Options for env_id in TASKS}
 def wrong_values(rule: Rule) -> list[Any]:
     if isinstance(rule, OrNone):
         return [value for value in wrong_values(rule.rule) if value is not None]
-    if isinstance(rule, NumberOrPair):
-        low, high = 4.0, 6.0
-        pairs: list[Any] = [(high, low), (low,), (), (low, low, high), (low, "x")]
-        return pairs + wrong_values(rule.limits)
     if isinstance(rule, Choice):
         return ["neither", 3, ["full"]]
     if not isinstance(rule, Limits):
         return [3]
-    values = ["57", True, None, math.nan, math.inf, 10**400, [[3.0]]]
+    values: list[Any] = ["57", True, None, math.nan, math.inf, 10**400, [[3.0]]]
     values += [edge for edge in (rule.low - 1, 2 * rule.high + 1) if math.isfinite(edge)]
     values += [2.5] * rule.whole
+    if isinstance(rule, NumberOrPair):
+        low, high = 4.0, 6.0
+        values += [(high, low), (low,), (), (low, low, high), (low, "x")]
     if rule.count == 1:
         return values
     count = rule.count or 3

@@ -6,7 +6,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
-from contracts import GOAL_OFFSET, NOW, TABLES, observed, rows_of
+from contracts import GOAL_OFFSET, TABLES, observed, rows_of
 from pilot import Pilot, fly, limited
 from rotorgram.models import Vehicle
 
@@ -18,7 +18,7 @@ HALF = (0.5, 0.5, 0.5)
 
 def begun(share: float = 0.0, **options: Any) -> Any:
     task = task_of(ID, **{"trajectory": "circle", "preview": 1, **options})
-    task.begin(NOW, Shares(share, HALF))
+    task.begin(Shares(share, HALF))
     return task
 
 
@@ -32,7 +32,7 @@ def goal_after(task: Any, steps: int) -> Any:
 def test_a_circle_by_hand() -> None:
     """2 m in 10 s: after a quarter it is at the top, as fast as 2 π 2 m / 10 s."""
     task = task_of(ID, center=(1.0, 2.0, 6.0))
-    pose = task.begin(NOW, Shares(0.25, (1.0, 0.5, 0.5)))
+    pose = task.begin(Shares(0.25, (1.0, 0.5, 0.5)))
     assert pose.position == pytest.approx([1.3, 4.0, 6.0], abs=1e-9)  # 0.3 m aside
     assert pose.velocity == pytest.approx([-0.4 * math.pi, 0.0, 0.0], abs=1e-9)
     another_quarter = goal_after(task, 125)

@@ -154,7 +154,9 @@ def test_wrong_options_of_a_reset(options: dict[str, Any], expected: str) -> Non
 
 @pytest.mark.parametrize("seed", [-1, [1], [1, -1], 0.5, "12", np.array(3)])
 def test_wrong_seeds(seed: Any) -> None:
-    with pytest.raises(InputError, match=r"^seed: expected a whole number from 0 on, or 2 of them"):
+    with pytest.raises(
+        InputError, match=r"^seed: expected a whole number of at least 0, or none, or 2 of them"
+    ):
         LocalVectorEnv(ID, 2).reset(seed=seed)
 
 

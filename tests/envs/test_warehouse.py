@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from contracts import NOW, loop_of
+from contracts import loop_of
 from rotorgram.models import InputError
 from rotorgram.scenes import SceneConfig, Solids
 from rotorgram.scenes.generators import drafted
@@ -24,7 +24,7 @@ def begun() -> Any:
     task = task_of(WAREHOUSE, aisles=3)
     shares = Shares((0.5, 0.5), 1.5)
     shares.openings = OPEN
-    return task, task.begin(NOW, shares)
+    return task, task.begin(shares)
 
 
 @pytest.mark.parametrize(

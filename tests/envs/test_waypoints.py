@@ -6,7 +6,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
-from contracts import GOAL_OFFSET, NOW, TABLES, observed, rows_of
+from contracts import GOAL_OFFSET, TABLES, observed, rows_of
 from pilot import Pilot, fly, limited
 from rotorgram.models import Vehicle
 
@@ -18,7 +18,7 @@ ID = "rotorgram/Waypoints-v0"
 def begun(*places: tuple[float, float, float], **options: Any) -> Any:
     """A task whose start and points lie at these shares of the box from one side to the other."""
     task = task_of(ID, **{"points": len(places) - 1, **options})
-    task.begin(NOW, Shares(*places))
+    task.begin(Shares(*places))
     return task
 
 
@@ -35,7 +35,7 @@ ABOVE = (1.0, 0.5, 1.0)
 
 def test_starts_and_points_by_hand() -> None:
     task = task_of(ID, points=2, center=(1.0, 2.0, 6.0), box=(2.0, 4.0, 1.0))
-    pose = task.begin(NOW, Shares((0.0, 0.5, 1.0), EAST, MIDDLE))
+    pose = task.begin(Shares((0.0, 0.5, 1.0), EAST, MIDDLE))
     assert pose.position.tolist() == [-1.0, 2.0, 7.0]
     assert pose.quaternion is None
     assert task.goal(state_of()).tolist() == [3.0, 2.0, 6.0]

@@ -29,7 +29,7 @@ class Options:
     wind: Annotated[tuple[float, ...], Limits(-9, 9, "m/s", count=3)] = (0.0, 0.0, 0.0)
     share: Annotated[float | None, Limits(0.0, 1.0)] = None
     length: Annotated[float | None, Limits(0.0, 2.0, "m")] = None
-    speed: Annotated[float | tuple[float, float], NumberOrPair(Limits(0, 5, "m/s"))] = 1.0
+    speed: Annotated[float | tuple[float, float], NumberOrPair(0, 5, "m/s")] = 1.0
     frame: Literal["body", "world"] = "body"
     name: Annotated[str, printable(5)] = "quad"
     shadows: bool = False

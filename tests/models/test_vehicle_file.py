@@ -425,7 +425,8 @@ def test_mjcf_with_coefficients_from_toml(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"^rotors.list: expected none for a model's file with ac"):
         load(tmp_path, OF_URDF.replace("quad.urdf", "tiny.xml"))
     with pytest.raises(
-        InputError, match=r"^rotors: expected no reaction for rotors of the model's"
+        InputError,
+        match=r"^rotors of the model's file: expected some of radius, .*, got 'reaction'",
     ):
         load(tmp_path, more.replace("radius", "reaction"))
 

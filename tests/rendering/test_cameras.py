@@ -98,8 +98,7 @@ def test_cameras_of_a_toml_file(tmp_path: Path) -> None:
     assert {*named} == {"belly", "tower", "front", "down"}
     belly = named["belly"]
     tower = named["tower"]
-    assert belly.width == 48
-    assert belly.height == 32
+    assert belly.resolution == (48, 32)
     assert belly.every == 2
     assert belly.kinds == ("rgb", "depth")
     assert belly.fovy == pytest.approx(1.0, rel=1e-6)
@@ -118,8 +117,7 @@ def test_cameras_of_an_mjcf_file(tmp_path: Path) -> None:
     named = {camera.name: camera for camera in Vehicle.load(file).file_cameras}
     assert {*named} == {"eye", "chase", "portrait"}  # the others are those of quad.xml
     eye = named["eye"]
-    assert eye.width == 40
-    assert eye.height == 30
+    assert eye.resolution == (40, 30)
     assert eye.every == 4
     assert eye.kinds == ("rgb", "segmentation")
     assert eye.look == (0.0, 0.0, -1.0)  # MuJoCo's: along -z

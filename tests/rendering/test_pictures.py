@@ -11,8 +11,10 @@ from typing import Any
 import numpy as np
 import pytest
 from pictures import HEIGHT, HEXA, TINY, WIDTH, at
+from rotorgram.envs import Metric
+from rotorgram.envs.rendering import metric_line
 from rotorgram.models import InputError
-from rotorgram.rendering import CAMERAS, Camera, Canvas, MetricValue, Stage
+from rotorgram.rendering import CAMERAS, Camera, Canvas, Stage
 
 
 @pytest.fixture(scope="module")
@@ -257,9 +259,9 @@ def test_lines_are_written_in_the_upper_left_corner(stage: Stage, canvas: Canvas
 
 
 def test_lines_follow_the_task_and_the_vehicle() -> None:
-    position = MetricValue("position_error", 0.25, "m", "e")
-    heading = MetricValue("heading_error", -12.345, "deg")
-    gates = MetricValue("gates_passed", 3.0)
+    position = metric_line(Metric(name="position_error", unit="m", symbol="e"), 0.25)
+    heading = metric_line(Metric(name="heading_error", unit="deg"), -12.345)
+    gates = metric_line(Metric(name="gates_passed", unit=""), 3.0)
     hover = at(1.0, 0.25, metrics=(position, heading, gates))
     assert hover.lines == [
         ("e", "0.250 m"),

@@ -63,8 +63,8 @@ def test_a_picture_of_one_drone_and_the_same_bits(env_id: str, vehicle: Any) -> 
 
 def test_a_picture_of_each_of_many() -> None:
     class Stairs(Elevation):
-        def begin(self, mask: Any, draw: Any) -> InitialState:
-            super().begin(mask, draw)
+        def begin(self, draw: Any) -> InitialState:
+            super().begin(draw)
             return InitialState(position=stack((0.0, 0.0, np.array([[4.0], [5.0], [6.0]]))))
 
     register("Stairs-v0", Stairs)

@@ -362,7 +362,7 @@ def test_a_watcher_counts_steps_and_episodes_of_each_drone() -> None:
     first, second = view.drawn[-1]
     assert first.position == (0.0, 4.0, 0.0)
     assert first.goal == (0.0, 4.5, 0.0)
-    assert first.metrics == (("elevation_error", 0.5, "m", "E"),)
+    assert first.metrics == (("E", "0.500 m"),)
     assert (first.reward, second.reward) == (0.25, 0.0)  # no step led to a start
 
 
