@@ -36,9 +36,8 @@ _WE: Final = (245, common.MAV_COMP_ID_ONBOARD_COMPUTER)
 _BUILD: Final = Path("build/px4_sitl_default")
 _PARAMETERS: Final = {
     "COM_RC_IN_MODE": 4.0,  # no sticks
-    "NAV_DLL_ACT": 0.0,  # no ground station
-    "COM_DISARM_PRFLT": -1.0,  # it may stand armed
     "SDLOG_MODE": -1.0,
+    "MPC_TKO_RAMP_T": 0.0,  # its integrators would wind up while it stands under thrust
 }
 
 
@@ -74,6 +73,7 @@ def parameters(vehicle: Vehicle, propellers: Propellers) -> dict[str, float]:
     for axes in ("XY", "Z"):
         found[f"MPC_{axes}_P"] = gains.position
         found[f"MPC_{axes}_VEL_P_ACC"] = gains.velocity
+        found[f"MPC_{axes}_VEL_I_ACC"] = gains.velocity * gains.position / 4.0
     return found
 
 
@@ -168,7 +168,8 @@ class Px4:
             while True:
                 for message in self._offboard.parse_buffer(self._link.recv(2048)) or ():
                     if message.get_type() == "STATUSTEXT":
-                        self.why = message.text
+                        begun = self.why if message.chunk_seq else ""
+                        self.why = begun + message.text.rstrip()
 
     def close(self) -> None:
         """As `Stack.close`."""

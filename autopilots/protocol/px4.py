@@ -34,10 +34,12 @@ OFFBOARD: Final = 6
 _FIELD: Final = np.array(SENSOR_TYPES["magnetometer"].about.settings["field"].default)
 _GAUSS: Final = 0.01  # per µT
 _TEMPERATURE: Final = 15.0  # °C
+_ALIVE: Final = 1e-3  # G/s and °C/s: PX4 takes values within 1e-6 of each other for equal
 _FIELDS: Final = 0x1BFF  # of HIL_SENSOR: all but the differential pressure
 _FIX: Final = 3  # in three dimensions
 _ACCURACY: Final = 50  # cm, of the position that GPS claims
 _SATELLITES: Final = 12
+_NO_COURSE: Final = 65535  # PX4 reads the velocity
 _POSITION_AND_YAW: Final = 0b100111111000  # what a setpoint leaves out has its bit set
 
 
@@ -47,8 +49,13 @@ def microseconds(reading: Reading) -> int:
 
 
 def sensors(reading: Reading) -> Message:
-    """Accelerometer, gyro, magnetometer and barometer. Sets PX4's clock."""
-    field = _GAUSS * to_body(reading.quaternion, _FIELD)
+    """Accelerometer, gyro, magnetometer and barometer. Sets PX4's clock.
+
+    PX4 drops a magnetometer or a barometer that repeats its values, and without a heading it does
+    not arm: field and temperature change by 4e-6 G and °C in each message.
+    """
+    alive = _ALIVE * (reading.time % 0.1)
+    field = _GAUSS * to_body(reading.quaternion, _FIELD) + alive
     altitude = frames.ORIGIN[2] + float(reading.position[2])
     return common.MAVLink_hil_sensor_message(
         microseconds(reading),
@@ -58,7 +65,7 @@ def sensors(reading: Reading) -> Message:
         float(isa_pressure(altitude)) / 100.0,  # hPa
         0.0,
         altitude,
-        _TEMPERATURE,
+        _TEMPERATURE + alive,
         _FIELDS,
     )
 
@@ -66,7 +73,6 @@ def sensors(reading: Reading) -> Message:
 def fix(reading: Reading) -> Message:
     """What GPS reads."""
     north, east, down = frames.north_east_down(100.0 * reading.velocity)
-    course = round(100.0 * math.degrees(math.atan2(east, north))) % 36000
     return common.MAVLink_hil_gps_message(
         microseconds(reading),
         _FIX,
@@ -77,7 +83,7 @@ def fix(reading: Reading) -> Message:
         round(north),
         round(east),
         round(down),
-        course,
+        _NO_COURSE,
         _SATELLITES,
     )
 
@@ -109,13 +115,25 @@ def setpoint(order: Order, system: int) -> Message:
 
 
 def requests(system: int) -> list[Message]:
-    """To fly by setpoints from outside, and to let the motors turn."""
-    wanted = (
-        (common.MAV_CMD_DO_SET_MODE, common.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED, OFFBOARD),
-        (common.MAV_CMD_COMPONENT_ARM_DISARM, 1.0, 0.0),
-    )
+    """To fly by setpoints from outside, and to let the motors turn.
+
+    A heartbeat comes first: PX4 says why it does not arm only to a ground station.
+    """
     rest = 5 * [0.0]
     return [
-        common.MAVLink_command_long_message(system, 1, number, 0, *values, *rest)
-        for number, *values in wanted
+        common.MAVLink_heartbeat_message(
+            common.MAV_TYPE_GCS, common.MAV_AUTOPILOT_INVALID, 0, 0, common.MAV_STATE_ACTIVE, 3
+        ),
+        common.MAVLink_command_long_message(
+            system,
+            1,
+            common.MAV_CMD_DO_SET_MODE,
+            0,
+            common.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED,
+            OFFBOARD,
+            *rest,
+        ),
+        common.MAVLink_command_long_message(
+            system, 1, common.MAV_CMD_COMPONENT_ARM_DISARM, 0, 1.0, 0.0, *rest
+        ),
     ]

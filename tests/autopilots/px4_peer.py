@@ -4,13 +4,16 @@ It knows nothing of rotorgram: NumPy and pymavlink alone.
 
 * `simulator_mavlink`: connects to TCP 4560 + instance, asks for ground truth, says a heartbeat. A
   HIL_SENSOR of id 0 sets the clock. Outputs are sent from when the modules run, once for each
-  update of the gyro, with the clock's time; they are 0 while disarmed.
+  update of the gyro, with the clock's time, in whole microseconds of PWM; they are 0 while
+  disarmed.
+* `DataValidator`: a magnetometer that repeats its values is not used.
 * Startup script: parameters from variables PX4_PARAM_*, ports 14580 and 14540 for offboard.
 * `commander`: arms when the estimate is there; offboard needs a second of setpoints, and ends a
-  second after the last.
+  second after the last. Texts go to ground stations alone, in pieces of 50 characters.
 * `mc_pos_control`, `mc_att_control`, `mc_rate_control`, `control_allocator`: their laws, with their
-  parameters, in short. The estimator integrates the IMU and follows GPS with fixed gains; PX4's
-  is an EKF.
+  parameters, in short. It takes off only for a goal above it, with a ramp of the largest velocity
+  upwards, during which the integrators run. The estimator integrates the IMU and follows GPS with
+  fixed gains; PX4's is an EKF.
 
 The variable PEER_FAULT makes it fail at 12 s: dies, hangs, closes, nan; no_lockstep at once.
 """
@@ -29,6 +32,24 @@ DECLINATION = math.radians(3.42)  # at Zurich
 EARTH = 6_371_000.0
 DOWN = np.array((0.0, 0.0, 1.0))
 CUSTOM_OFFBOARD = 6
+
+
+BOOT = 2.0
+"""Time from the first sensors to the estimator on a slow machine, s."""
+
+
+class Validator:
+    """Of a magnetometer: whether it lives."""
+
+    def __init__(self):
+        self.last = np.zeros(3)
+        self.equal = 0
+
+    def lives(self, values):
+        for before, value in zip(self.last, values, strict=True):
+            self.equal = self.equal + 1 if abs(before - value) < 1e-6 else 0
+        self.last = values
+        return self.equal <= 1000
 
 
 def parameter(name, default):
@@ -125,9 +146,9 @@ class Allocator:
     def outputs(self, torques, collective):
         wanted = np.clip(self.mix @ (*torques, -collective), 0.0, 1.0)
         f = self.factor
-        if f == 0.0:
-            return wanted
-        return (np.sqrt((1 - f) ** 2 + 4 * f * wanted) - (1 - f)) / (2 * f)
+        if f != 0.0:
+            wanted = (np.sqrt((1 - f) ** 2 + 4 * f * wanted) - (1 - f)) / (2 * f)
+        return np.trunc(1000.0 * wanted) / 1000.0
 
 
 class Controller:
@@ -138,7 +159,11 @@ class Controller:
         self.least = parameter("MPC_THR_MIN", 0.12)
         self.p = np.array([parameter(f"MPC_{a}_P", 1.0) for a in ("XY", "XY", "Z")])
         self.v = np.array([parameter(f"MPC_{a}_VEL_P_ACC", 2.0) for a in ("XY", "XY", "Z")])
-        self.vi = np.array((0.4, 0.4, 2.0))
+        integral = {"XY": 0.4, "Z": 2.0}
+        self.vi = np.array(
+            [parameter(f"MPC_{a}_VEL_I_ACC", integral[a]) for a in ("XY", "XY", "Z")]
+        )
+        self.ramp = parameter("MPC_TKO_RAMP_T", 3.0)
         axes = ("ROLL", "PITCH", "YAW")
         self.attitude = np.array([parameter(f"MC_{a}_P", 5.0) for a in axes])
         self.rate = np.array([parameter(f"MC_{a}RATE_P", 0.15) for a in axes])
@@ -148,29 +173,47 @@ class Controller:
     def reset(self):
         self.torque = np.zeros(3)
         self.lift = np.zeros(3)
-        self.since = None
+        self.since = None  # it is armed, s
+        self.lifts = None  # the ramp began, s
+        self.landed = True
 
-    def step(self, now, dt, estimate, rates, goal, yaw):
+    def climb(self, now, above):
+        """Largest velocity upwards, m/s, and whether it flies. None before the take-off."""
         if self.since is None:
             self.since = now
+        if self.lifts is None:
+            if now - self.since < 1.0 or not above:  # the spool-up, or no goal above it
+                return None, False
+            self.lifts = now
+        share = (now - self.lifts) / self.ramp if self.ramp > 0.0 else 1.0
+        none = -G / self.v[2]  # downwards: it asks for no thrust
+        return none + min(share, 1.0) * (3.0 - none), share >= 1.0
+
+    def step(self, now, dt, estimate, rates, goal, yaw):
+        up, flies = self.climb(now, goal[2] < estimate.position[2])
+        if up is None:
+            return np.zeros(3), 0.0
         wanted = self.p * (goal - estimate.position)
         level = np.linalg.norm(wanted[:2])
-        wanted[:2] *= min(1.0, 5.0 / max(level, 1e-9))
-        wanted[2] = np.clip(wanted[2], -3.0, 1.5)
-        ramp = (now - self.since - 1.0) / 3.0  # after the spool-up
+        wanted[:2] *= min(1.0, 12.0 / max(level, 1e-9))
+        wanted[2] = max(min(wanted[2], 1.5), -up)
         error = wanted - estimate.velocity
         acceleration = self.v * error + self.lift
-        if ramp > 1.0:
-            self.lift = np.clip(self.lift + self.vi * error * dt, -3.0, 3.0)
         body_z = np.array((-acceleration[0], -acceleration[1], G))
         tilt = math.atan2(np.linalg.norm(body_z[:2]), G)
-        if tilt > math.radians(45):
-            body_z[:2] *= math.tan(math.radians(45)) / math.tan(tilt)
+        most = math.radians(45 if flies else 12)
+        if tilt > most:
+            body_z[:2] *= math.tan(most) / math.tan(tilt)
         body_z /= np.linalg.norm(body_z)
         collective = (self.hover - acceleration[2] * self.hover / G) / body_z[2]
-        collective = np.clip(collective, self.least, 1.0)
-        if ramp < 1.0:
-            collective = min(collective, max(0.0, ramp) * 1.5 * self.hover)
+        least = self.least if flies else 0.001
+        if (collective <= least and error[2] > 0.0) or (collective >= 1.0 and error[2] < 0.0):
+            error[2] = 0.0
+        self.lift += self.vi * error * dt
+        self.lift[2] = np.clip(self.lift[2], -G, G)
+        collective = np.clip(collective, least, 1.0)
+        if collective > self.least + 0.1 * (self.hover - self.least):
+            self.landed = False
         left = np.cross(body_z, (math.cos(yaw), math.sin(yaw), 0.0))
         left /= np.linalg.norm(left)
         wanted_r = np.array((np.cross(left, body_z), left, body_z)).T
@@ -178,7 +221,7 @@ class Controller:
         turn = np.array((off[2, 1] - off[1, 2], off[0, 2] - off[2, 0], off[1, 0] - off[0, 1])) / 2
         rate_error = self.attitude * turn - rates
         torques = self.rate * rate_error + self.torque
-        if ramp > 1.0:
+        if not self.landed:
             self.torque = np.clip(self.torque + self.rate_i * rate_error * dt, -0.3, 0.3)
         return torques, collective
 
@@ -197,6 +240,8 @@ class Px4:
         self.estimate = Estimator()
         self.control = Controller()
         self.allocator = Allocator()
+        self.magnetometer = Validator()
+        self.station = -math.inf  # latest heartbeat of a ground station, s
         self.clock = None  # µs
         self.first = None
         self.armed = False
@@ -214,13 +259,17 @@ class Px4:
     def tell(self, message):
         self.udp.sendto(message.pack(self.offboard_mav), self.there)
 
-    def say(self, text):
-        self.tell(common.MAVLink_statustext_message(4, text.encode()))
+    def say(self, now, text):
+        if now - self.station > 2.5:
+            return
+        for piece in range(0, len(text), 50):
+            words = text[piece : piece + 50].encode()
+            self.tell(common.MAVLink_statustext_message(4, words, 1, piece // 50))
 
     def run(self):
         while received := self.tcp.recv(4096):
             for message in self.mav.parse_buffer(received) or ():
-                if message.get_type() == "HIL_GPS":
+                if message.get_type() == "HIL_GPS" and self.estimate.r is not None:
                     self.estimate.fix(message)
                 elif message.get_type() == "HIL_SENSOR" and message.id == 0:
                     self.sensor(message)
@@ -238,7 +287,9 @@ class Px4:
         force = np.array((message.xacc, message.yacc, message.zacc))
         rates = np.array((message.xgyro, message.ygyro, message.zgyro))
         field = np.array((message.xmag, message.ymag, message.zmag))
-        self.estimate.inertial(force, rates, field, dt)
+        lives = self.magnetometer.lives(field)
+        if self.estimate.r is not None or (lives and now - self.first * 1e-6 > BOOT):
+            self.estimate.inertial(force, rates, field, dt)
         self.hear(now)
         if now - self.beat >= 1.0:
             self.beat = now
@@ -283,6 +334,10 @@ class Px4:
             except BlockingIOError:
                 return
             for message in self.offboard_mav.parse_buffer(datagram) or ():
+                if message.get_type() == "HEARTBEAT":
+                    if message.type == common.MAV_TYPE_GCS:
+                        self.station = now
+                    continue
                 if message.target_system not in (0, 1 + self.instance):
                     continue
                 if message.get_type() == "SET_POSITION_TARGET_GLOBAL_INT":
@@ -312,12 +367,12 @@ class Px4:
             if accepted:
                 self.mode = wanted
         elif message.command == common.MAV_CMD_COMPONENT_ARM_DISARM:
-            accepted = self.estimate.fixes >= 70 and "refuses" not in self.fault
+            accepted = self.estimate.fixes >= 20 and "refuses" not in self.fault
             if accepted and not self.armed:
                 self.armed = message.param1 == 1.0
                 self.control.reset()
             if not accepted:
-                self.say("Arming denied: no valid position")
+                self.say(now, "Arming denied: Resolve system health failures first\t")
         self.tell(common.MAVLink_command_ack_message(message.command, 0 if accepted else 1))
 
 
