@@ -23,6 +23,7 @@ from ..models import InputError
 from ..models.fields import immutable
 from ..scenes import SceneConfig
 from ..scenes.returns import RANGES, Reading
+from ..sim.state import some
 
 if TYPE_CHECKING:
     from ..sim.sensors.range_sensors import RangeSensor
@@ -256,16 +257,22 @@ def _fly_batch(
     terminated = np.zeros(env.num_envs, bool)
     lost = env.lost
     done = lost | (np.arange(env.num_envs) >= used)
-    while not done.all():
-        chosen = _act(env, policies, done)
-        env.advance(chosen, frozen=worlds_done(done, drones) if done.any() else None)
+    frozen = worlds_done(done, drones) if some(done) else None
+    flying = np.flatnonzero(~done).tolist()
+    while flying:
+        chosen = _act(env, policies, flying)
+        env.advance(chosen, frozen=frozen)
         rows.append(_row(env, wanted))
         rewards.append(env.rewards)
         actions.append(chosen)
-        lengths += ~done
-        terminated = terminated | (env.terminated & ~done)
-        lost = lost | (env.lost & ~done)
-        done = done | env.terminated | env.truncated
+        ended = env.terminated | env.truncated
+        if some(ended):
+            lengths[flying] = len(rewards)
+            terminated = terminated | (env.terminated & ~done)
+            lost = lost | (env.lost & ~done)
+            done = done | ended
+            frozen = worlds_done(done, drones)
+            flying = np.flatnonzero(~done).tolist()
     arrays = {name: np.array([row[name] for row in rows]) for name in rows[0]}
     all_rewards = np.array(rewards)
     all_actions = np.array(actions)
@@ -301,12 +308,12 @@ def _row(env: AdvancingVectorEnv, wanted: Sequence[str]) -> Mapping[str, Array]:
 
 
 def _act(
-    env: AdvancingVectorEnv, policies: Sequence[Policy | None], done: NDArray[np.bool_]
+    env: AdvancingVectorEnv, policies: Sequence[Policy | None], flying: Sequence[int]
 ) -> Array:
     """Actions of the drones that fly; 0 for the others."""
     space = env.single_action_space
     actions = np.zeros((env.num_envs, *(space.shape or ())), space.dtype)
-    for drone in np.flatnonzero(~done).tolist():
+    for drone in flying:
         policy = policies[drone]
         action = space.sample() if policy is None else policy.act(_seen_by(drone, env.observations))
         if np.shape(action) != space.shape:
