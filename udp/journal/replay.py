@@ -14,6 +14,7 @@ from ...models import Backend
 from ...models.errors import InputError, printable, shortened
 from ..protocol.layout import Array
 from ..protocol.messages import Command, State
+from ..protocol.party import follow
 from ..transport.simulator import COMMAND_AGE
 from ..transport.stepped import Steppable, make_stepped
 from .reader import Item, Recording, Session, count_of
@@ -102,8 +103,7 @@ class SessionVerdict:
         if command is None:
             number = state.sequence - 1
             raise InputError(f"expected Command {number} before it, got none of that number")
-        resets = command.resets
-        self._loop.advance(command.actions, resets, command.seeds, command.frozen, command.asks)
+        follow(self._loop, command)
         return self._loop
 
     def _make(self) -> Steppable:
