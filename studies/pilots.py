@@ -1,12 +1,14 @@
 """Pilots side by side: flight stacks, our controllers and policies, RAPTOR, on the same flights.
 
     python studies/pilots.py --betaflight PATH --crazyflie PATH --ardupilot PATH [--vehicle NAME]
-        [--seeds 5] [--tasks Waypoints Tracking] [--only NAME ...] [--film film.mp4]
+        [--seeds 5] [--tasks Waypoints Tracking] [--cases wind ...] [--only NAME ...]
+        [--film film.mp4]
 
 Each pilot flies the same starts of each task in calm air, and with each of the events of `CASES`.
 Policies are PPO, trained here on the task in calm air. Stacks whose program is not given, and
 RAPTOR without its package, are left out and named. Rows that are there already are kept; those of
-`--only` are flown anew. Energy is the electrical one of the vehicle's file, power times thrust^1.5.
+`--only` are flown anew. The film shows the first flights of Tracking in wind that are flown.
+Energy is the electrical one of the vehicle's file, power times thrust^1.5.
 
 Of Tracking, `error` is the root mean square of the distance from where the craft should be, m; of
 Waypoints that from the next point when the flight ended, 0 where all were passed, and `seconds` is
@@ -237,7 +239,8 @@ def shown(result: Mapping[str, Row], vehicle: str, tasks: list[str]) -> None:
 def main() -> None:
     parser = options(
         __doc__, betaflight=Path, crazyflie=Path, ardupilot=Path, vehicle="crazyflie2", seeds=5,
-        tasks=["Waypoints", "Tracking"], only=["all"], film=Path, out=RESULTS / "pilots.json",
+        tasks=["Waypoints", "Tracking"], cases=list(CASES), only=["all"], film=Path,
+        out=RESULTS / "pilots.json",
     )  # fmt: skip
     args = parser.parse_args()
     vehicle = Vehicle.load(args.vehicle)
@@ -249,7 +252,7 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as folder:
         pilots = Pilots(programs, args.vehicle, Path(folder))
         print("not here:", ", ".join(pilots.missing) or "none")
-        for task, name, pilot in product(args.tasks, CASES, PILOTS):
+        for task, name, pilot in product(args.tasks, args.cases, PILOTS):
             case = Case(task, args.vehicle, name)
             key = f"{task} {name} {pilot}"
             wanted = pilot in args.only or (args.only == ["all"] and key not in kept)
