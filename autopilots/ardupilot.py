@@ -7,13 +7,14 @@ import math
 import tomllib
 from contextlib import suppress
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Final
 
 import numpy as np
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from ..agents.policies import Observation
 from ..models import InputError, Vehicle
-from ..models.errors import require
 from ..sim.control.gains import Gains
 from .programs import HOST, Program
 from .protocol import ardupilot as protocol
@@ -74,7 +75,7 @@ def tuning(vehicle: Vehicle, propellers: Propellers) -> dict[str, float]:
     """Parameters of a vehicle: its loops are as fast as those of our own control levels."""
     lag = vehicle.coefficients["rotors.time_constant"] or 0.0
     gains = Gains.of(vehicle, PERIOD, lag)
-    hover = float(vehicle.hover_thrust.sum() / vehicle.thrust_high.sum())
+    hover = propellers.share
     acceleration = min(MOST_ACCELERATION, gains.most_acceleration[0] / 2.0)
     levers = vehicle.allocation[1:]
     torques = levers**2 @ vehicle.thrust_high / np.abs(levers).max(axis=1)
@@ -111,9 +112,6 @@ class ArduPilot:
             raise InputError("real_time: expected lock-step with ardupilot, got real time")
         self._auto = mode == "auto"
         self._goal = np.full(3, np.inf)
-        self._mavlink = require("pymavlink.dialects.v20.ardupilotmega", "autopilot", "ardupilot")
-        self._mav = self._mavlink.MAVLink(None, srcSystem=255)
-        self._mav.robust_parsing = True
         frame_class, frame_type, self._order = motor_order(vehicle)
         values = _TABLES["parameters"] | tuning(vehicle, Propellers(config, vehicle))
         values |= {"FRAME_CLASS": frame_class, "FRAME_TYPE": frame_type}
@@ -137,6 +135,8 @@ class ArduPilot:
         self._program = Program("ardupilot", 0)
         self._talk = self._program.listen(0)
         self._talk.setblocking(False)
+        self._mav = mavlink.MAVLink(SimpleNamespace(write=self._talk.send), srcSystem=255)
+        self._mav.robust_parsing = True
         self._heard = False
         lines = [f"{name} {value:.6g}\n" for name, value in values.items()]
         (self._program.folder / "vehicle.parm").write_text("".join(lines))
@@ -212,13 +212,13 @@ class ArduPilot:
         elif self._auto:
             if np.linalg.norm(order.goal - self._goal) > MOVED:
                 self._goal = order.goal
-                self._send("mission_count", 1, 1, 2)
+                self._mav.mission_count_send(1, 1, 2)
         else:
             goal = north_east_down(order.goal - origin)
             yaw = math.pi / 2 - order.heading
             moves = [0.0] * 6
             fields = (0, 1, 1, 1, _POSITION_AND_YAW, *goal, *moves, yaw, 0)
-            self._send("set_position_target_local_ned", *fields)
+            self._mav.set_position_target_local_ned_send(*fields)
 
     def _send_item(self, number: int) -> None:
         """Of a mission to the goal. Its first item, home, has no effect."""
@@ -226,15 +226,11 @@ class ArduPilot:
         latitude, longitude, _ = geodetic(self._goal, _EARTH)
         height = self._goal[2] - self._origin[2]
         fields = (_ABOVE_HOME, _WAYPOINT, 0, 1, 1, 0, 0, 0, latitude, longitude, height)
-        self._send("mission_item_int", 1, 1, number, *fields)
+        self._mav.mission_item_int_send(1, 1, number, *fields)
 
     def _command(self, number: int, *values: int) -> None:
         filled = (*values, *[0] * 7)[:7]
-        self._send("command_long", 1, 1, number, 0, *filled)
-
-    def _send(self, name: str, *fields: float) -> None:
-        message = getattr(self._mavlink, f"MAVLink_{name}_message")(*fields)
-        self._talk.send(message.pack(self._mav))
+        self._mav.command_long_send(1, 1, number, 0, *filled)
 
     def close(self) -> None:
         """As `Stack.close`."""

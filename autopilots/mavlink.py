@@ -4,23 +4,25 @@ import socket
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import suppress
-from typing import Final, Protocol, TypeVar
+from typing import Final, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 from pymavlink.dialects.v20 import common
 
+from ..envs.autoreset import AdvancingVectorEnv
 from ..envs.spec import EnvSpec
 from ..flights.trajectories import Flights
 from ..models import InputError
 from ..udp.protocol.client import Address
+from ..udp.protocol.party import Mask, World
 from ..udp.transport.sockets import resolve
 from .protocol import frames
 
 Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 Row = Mapping[str, Array]
 """Telemetry of a drone by name, shape (n,)."""
+Flown = AdvancingVectorEnv | World
 Frame = TypeVar("Frame")
 
 POSE_PERIOD: Final = 0.02
@@ -36,18 +38,6 @@ _TYPES: Final = {4: common.MAV_TYPE_QUADROTOR, 6: common.MAV_TYPE_HEXAROTOR}
 _ACTUATORS: Final = 32  # of a message
 _CELLS: Final = 10
 _UNKNOWN: Final = 65535
-
-
-class Flown(Protocol):
-    """Drones of several worlds after a step, shape (N, ...)."""
-
-    rewards: Array
-    terminated: Mask
-    truncated: Mask
-
-    @property
-    def telemetry(self) -> Mapping[str, Array]:
-        """By name."""
 
 
 class MavlinkOut:
@@ -145,8 +135,7 @@ def _send_beat(link: common.MAVLink, row: Row) -> None:
 
 
 def _send_pose(link: common.MAVLink, row: Row, time_ms: int) -> None:
-    quaternion = row["attitude"]
-    angles = frames.angles_of(quaternion)
+    angles = frames.angles_of(row["attitude"])
     rates = frames.forward_right_down(row["body_rates"])
     position = frames.north_east_down(row["position"])
     velocity = frames.north_east_down(row["velocity"])
@@ -157,7 +146,6 @@ def _send_pose(link: common.MAVLink, row: Row, time_ms: int) -> None:
     thrusts = row["thrust"].tolist()
     rest = (_ACTUATORS - len(thrusts)) * [0.0]
     link.attitude_send(time_ms, *angles, *rates)
-    link.attitude_quaternion_send(time_ms, *frames.quaternion_of(quaternion), *rates)
     link.local_position_ned_send(time_ms, *position, *velocity)
     link.global_position_int_send(time_ms, *place, height, *speeds, heading)
     link.actuator_output_status_send(1000 * time_ms, len(thrusts), thrusts + rest)

@@ -51,7 +51,7 @@ def parameters(vehicle: Vehicle, propellers: Propellers) -> dict[str, float]:
         found[f"CA_ROTOR{number}_PY"] = -y
         found[f"CA_ROTOR{number}_KM"] = -rotor.reaction[2]
         found[f"PWM_MAIN_FUNC{number + 1}"] = _MAIN_MOTOR + number
-    hover = float(vehicle.hover_thrust.sum() / vehicle.thrust_high.sum())
+    hover = propellers.share
     throttle = propellers.hover
     # Its thrust at a throttle u is f u² + (1 - f) u; here f is right at hover.
     found["THR_MDL_FAC"] = (hover - throttle) / (throttle**2 - throttle)

@@ -61,6 +61,12 @@ class Propellers:
     """Thrust of a vehicle's rotors at a throttle: by its curve, or else the square.
 
     Where the effect `thrust_curve` is on, a throttle is the command, and the effect has the curve.
+
+    Attributes:
+        share: Thrust of a hover over the largest.
+        hover: Throttle of a hover.
+        slope: Of the thrust over the throttle there, N, shape (R,).
+        expo: Of ArduPilot's curve of thrust, the nearest to this one.
     """
 
     def __init__(self, config: EnvConfig, vehicle: Vehicle) -> None:
@@ -70,8 +76,8 @@ class Propellers:
         self._high = vehicle.thrust_high
         self._throttles = np.linspace(0.0, 1.0, 1025)
         self._shares = own(self._throttles)
-        hover = float(vehicle.hover_thrust.sum() / vehicle.thrust_high.sum())
-        self.hover = self.throttle(hover)
+        self.share = float(vehicle.hover_thrust.sum() / vehicle.thrust_high.sum())
+        self.hover = self.throttle(self.share)
         self.slope: Floats = self._high * own.deriv()(self.hover)
         bend = self._throttles * (self._throttles - 1.0)
         over = self._shares - self._throttles

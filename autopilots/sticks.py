@@ -5,7 +5,6 @@ the goal. The loops of the level turn its action into what a flight controller t
 """
 
 import copy
-import math
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any, NamedTuple
@@ -19,11 +18,8 @@ from ..envs.registry import env_spec
 from ..envs.spec import EnvSpec
 from ..models import InputError, Vehicle
 from ..sim.control import make_controller
-from ..sim.control.cascade import Position, Rates
-from ..sim.control.gains import Gains
-from ..sim.effects import NO_EFFECTS
-from ..sim.rotations import Parts, Rows, axes_of
-from ..sim.state import Array
+from ..sim.control.cascade import Attitude, Rates, tilt_of
+from ..sim.rotations import axes_of
 from .reading import Floats, Reading
 
 PERIOD = 0.01
@@ -55,23 +51,24 @@ class StickPilot:
         self, config: EnvConfig, vehicle: Vehicle, pilot: Pilot | None, acro: bool
     ) -> None:
         """Raises `InputError` for a policy that cannot fly so."""
-        level = "position"
         if pilot is None:
+            level = "position"
             spec = env_spec(config.changed(action=level, control_period=PERIOD))
             lag = max(vehicle.coefficients["rotors.time_constant"] or 0.0, LAG)
-            gains = Gains.of(vehicle, PERIOD + lag / 2)
-            loops: Rates = Position(vehicle, gains, NO_EFFECTS)
-            constants = {**spec.constants, **loops.constants}
-            self._policy: Policy = Geometric(replace(spec, constants=constants))
+            loops = make_controller(level, vehicle, PERIOD + lag / 2)
         else:
             spec = pilot.spec
             level = str(spec.options["action"])
-            controller = make_controller(level, vehicle, vehicle.timestep, config.effects)
-            if not isinstance(controller, Rates):
-                raise InputError(
-                    "policy: expected one of the levels rates, attitude, velocity or position, "
-                    f"got {level}"
-                )
+            loops = make_controller(level, vehicle, vehicle.timestep, config.effects)
+        if not isinstance(loops, Rates):
+            raise InputError(
+                "policy: expected one of the levels rates, attitude, velocity or position, "
+                f"got {level}"
+            )
+        if pilot is None:
+            constants = {**spec.constants, **loops.constants}
+            self._policy: Policy = Geometric(replace(spec, constants=constants))
+        else:
             other = set(spec.observation).difference(env_spec(config).observation)
             if other:
                 names = ", ".join(f"{one.name} of shape {one.shape}" for one in other)
@@ -79,25 +76,19 @@ class StickPilot:
                     f"policy: expected one that observes what {config.env_id} shows here, "
                     f"got {spec.env_id} with {names}"
                 )
-            loops = controller
             self._policy = copy.deepcopy(pilot.policy)
         self._policy.reset()
         self.period = spec.control_period
-        self.acro = acro or level == "rates"
+        self.acro = acro or not isinstance(loops, Attitude)
         self.gains = loops.gains
         self._loops = loops
-        if self.acro:
-            vars(loops)["turn"] = _rates
-        else:
-            vars(loops)["point"] = _attitude
 
     def held(self, weight: float, reading: Reading) -> Floats:
         """Demands of a craft on its stand, so that no loop winds up there."""
         if self.acro:
             return np.array((weight, 0.0, 0.0, 0.0))
-        axes = axes_of(reading.quaternion)
-        held: Floats = _attitude(weight, axes[2], 0.0, axes, None)
-        return held
+        nose, _, up = axes_of(reading.quaternion)
+        return np.array((weight, *tilt_of(up, nose), 0.0))
 
     def demands(self, reading: Reading, observation: Observation) -> Floats:
         """Collective thrust, N, with roll and pitch, rad, and yaw rate, rad/s, or with body rates,
@@ -105,20 +96,11 @@ class StickPilot:
         """
         action = np.asarray(self._policy.act(observation), np.float64)
         state: Any = SimpleNamespace(quaternion=reading.quaternion, velocity=reading.velocity)
-        demands: Floats = self._loops.thrust(action, state)
-        return demands
-
-
-def _rates(collective: Array, rates: Parts, state: object) -> Array:
-    return np.array((collective, *rates))
-
-
-def _attitude(collective: Array, axis: Parts, yaw_rate: Array, axes: Rows, state: object) -> Array:
-    """Collective thrust, roll, pitch, yaw rate; as of the level `attitude`."""
-    x, y, z = axis
-    nose_x, nose_y, _ = axes[0]
-    length = math.hypot(nose_x, nose_y)
-    ahead = (nose_x * x + nose_y * y) / length
-    left = (nose_x * y - nose_y * x) / length
-    roll = -math.asin(max(-1.0, min(left, 1.0)))
-    return np.array((collective, roll, math.atan2(ahead, z), yaw_rate))
+        loops = self._loops
+        if self.acro:
+            collective, rates = loops.demands(action, state)
+            return np.array((collective, *rates))
+        assert isinstance(loops, Attitude)
+        axes = axes_of(reading.quaternion)
+        collective, axis, yaw_rate = loops.aimed(action, axes, state)
+        return np.array((collective, *tilt_of(axis, axes[0]), yaw_rate))

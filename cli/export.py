@@ -42,7 +42,6 @@ class Export(ModuleFlag):
 
 
 def _write_app(checkpoint: "Checkpoint", out: Path | None) -> None:
-    from ..agents.export.c import cost
     from ..agents.export.crazyflie import app
     from ..flights.folders import new_folder
 
@@ -51,4 +50,3 @@ def _write_app(checkpoint: "Checkpoint", out: Path | None) -> None:
     for name, content in files.items():
         write_whole(folder / name, content)
     print(f"app: {folder} ({len(files)} files)")
-    print(f"policy: {cost(checkpoint.policy())}")

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from ..models.errors import InputError, shortened
 from ..models.fields import Choice, Limits, Text, check, check_names, mapping
 from ..models.files import read_own_toml, read_toml
-from ..scenes.motion import REST
+from ..scenes.motion import REST, thrown
 from ..scenes.obstacles import Obstacle
 from .spec import Values
 
@@ -95,9 +95,9 @@ def balls_of(events: Sequence[Values]) -> "Solids":
     """What events throw, where it hangs before."""
     from ..scenes.solids import Solids  # it imports MuJoCo
 
-    thrown = [event for event in events if event["kind"] == BALL]
-    balls = [Obstacle(kind="sphere", size=(x["radius"],), position=x["start"]) for x in thrown]
-    motions = [(*x["velocity"], math.inf, *REST[4:]) for x in thrown]
+    found = [event for event in events if event["kind"] == BALL]
+    balls = [Obstacle(kind="sphere", size=(x["radius"],), position=x["start"]) for x in found]
+    motions = [thrown(x["velocity"], math.inf) for x in found]
     return replace(Solids.of_obstacles(balls), motions=np.reshape(motions, (-1, len(REST))))
 
 

@@ -9,9 +9,8 @@ from typing import Literal
 import numpy as np
 
 from ..models.errors import InputError
-from ..sim.control import CollectiveThrust, RotorThrust, lag_of
-from ..sim.control.cascade import Attitude, Position, Rates, Velocity, turned
-from ..sim.control.gains import Gains
+from ..sim.control import CollectiveThrust, RotorThrust, make_controller
+from ..sim.control.cascade import Attitude, Position, Rates, Velocity, tilt_of
 from ..sim.rotations import axes_of
 from ..sim.state import Array, WorldState, clip, stack
 from .tasks.task import Task
@@ -32,7 +31,6 @@ class Failsafe:
     def __init__(self, task: Task, measure: Measure) -> None:
         self._controller = controller = task.controller
         vehicle = task.vehicle
-        effects = task.config.effects
         if not isinstance(controller, RotorThrust | CollectiveThrust | Rates):
             raise InputError(
                 "failsafe: expected actions of a level, and drones of one vehicle, "
@@ -41,8 +39,10 @@ class Failsafe:
         if measure == "off" and not isinstance(controller, RotorThrust):
             raise InputError(f"off: expected actions of the level rotors, got {task.action}")
         self._measure = measure
-        gains = Gains.of(vehicle, task.control_period, lag_of(vehicle, effects))
-        self._pilot = Velocity(vehicle, gains, effects)
+        effects = task.config.effects
+        pilot = make_controller("velocity", vehicle, task.control_period, effects)
+        assert isinstance(pilot, Velocity)
+        self._pilot: Velocity = pilot
 
     def actions(self, telemetry: Mapping[str, Array]) -> Array:
         """Actions of N drones, float64, shape (N, k); choices have the shape (N,).
@@ -51,10 +51,8 @@ class Failsafe:
         """
         if self._measure == "off":
             return -np.ones_like(telemetry["thrust"])
-        return self._climbing(-DESCENT * (self._measure == "land"), state_of(telemetry))
-
-    def _climbing(self, speed: float, state: WorldState) -> Array:
-        """Actions that ask for a vertical speed, m/s, and for none across."""
+        speed = -DESCENT * (self._measure == "land")
+        state = state_of(telemetry)
         controller = self._controller
         pilot = self._pilot
         axes = axes_of(state.quaternion)
@@ -71,9 +69,7 @@ class Failsafe:
             still = 0.0 * collective
             asked = [still, still, still + speed / gain, still]
         elif isinstance(controller, Attitude):
-            x, y, _ = axes[0]
-            forward, left = turned((x, -y), axis[0], axis[1])
-            asked[1:] = np.arcsin(-left), np.arctan2(forward, axis[2]), 0.0
+            asked[1:] = *tilt_of(axis, axes[0]), 0.0
         return clip(stack(asked) / controller.constants["action_scale"], -1.0, 1.0)
 
 

@@ -141,20 +141,12 @@ def write(policy: NetworkPolicy, facts: Mapping[str, str]) -> bytes:
     return "\n".join(parts).encode()
 
 
-def cost(policy: NetworkPolicy) -> str:
-    """What a call takes, in words."""
-    program = _Program(policy)
-    constants = 4 * sum(values.size for values in program.tables.values())
-    return f"{constants:,} bytes of constants, {4 * program.numbers:,} bytes of the stack"
-
-
 class _Program:
     """Statements, and the tables that they use, of the layers of a policy.
 
     Attributes:
         at: Name of the array with the numbers so far, `size` of them.
         functions: Texts of those that the statements call.
-        numbers: Length of all arrays that a call declares.
     """
 
     def __init__(self, policy: NetworkPolicy) -> None:
@@ -163,7 +155,6 @@ class _Program:
         self.lines: list[str] = []
         self.at = "observation"
         self.size = flat_size(policy.spec)
-        self.numbers = 0
         write_layers(self, policy.network.layers)
         if policy.actions.discrete:
             self.lines.append("action[0] = 0.0f;")
@@ -230,7 +221,6 @@ class _Program:
         """The name of a new array of numbers, which is that of the numbers so far."""
         self.at = f"x{len(self.lines)}"
         self.size = size
-        self.numbers += size
         self.lines.append(f"float {self.at}[{size}];")
         return self.at
 

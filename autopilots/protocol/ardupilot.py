@@ -15,9 +15,6 @@ from ...models import InputError
 from ..reading import Reading
 from .frames import angles_of, forward_right_down, north_east_down
 
-PORT: Final = 9002
-"""Of the simulator."""
-
 _HEADER = struct.Struct("<HHI")
 _CHANNELS = {18458: 16, 29569: 32}
 _LOW, _HIGH = 1000.0, 2000.0  # µs
@@ -28,8 +25,6 @@ FIRST: Final = 0.001
 class Servos(NamedTuple):
     """What a program wants of its servos."""
 
-    rate: int
-    """Of its frames, Hz."""
     frame: int
     """Number of the frame."""
     throttles: NDArray[np.float64]
@@ -39,11 +34,11 @@ class Servos(NamedTuple):
 def servos(datagram: bytes) -> Servos:
     """Of a datagram. Raises `InputError`."""
     if len(datagram) >= _HEADER.size:
-        magic, rate, frame = _HEADER.unpack_from(datagram)
+        magic, _, frame = _HEADER.unpack_from(datagram)  # between them the rate of its frames
         count = _CHANNELS.get(magic, -1)
         if len(datagram) == _HEADER.size + 2 * count:
             pulses = np.frombuffer(datagram, "<u2", count, _HEADER.size)
-            return Servos(rate, frame, np.clip((pulses - _LOW) / (_HIGH - _LOW), 0.0, 1.0))
+            return Servos(frame, np.clip((pulses - _LOW) / (_HIGH - _LOW), 0.0, 1.0))
     raise InputError(f"ardupilot: expected a datagram of servos, got {datagram[:16].hex()}")
 
 

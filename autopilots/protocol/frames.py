@@ -31,12 +31,6 @@ def forward_right_down(vector: Floats) -> list[float]:
     return [x, -y, -z]
 
 
-def quaternion_of(quaternion: Floats) -> list[float]:
-    """From body to world, scalar first, of ours, shape (4,)."""
-    w, x, y, z = (math.sqrt(0.5) * quaternion).tolist()
-    return [w + z, x + y, x - y, w - z]
-
-
 def angles_of(quaternion: Floats) -> list[float]:
     """Roll, pitch and yaw from north, clockwise, rad, of our quaternion, shape (4,)."""
     (front_x, front_y, front_z), (*_, left_z), (*_, up_z) = axes_of(quaternion)

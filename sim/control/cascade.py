@@ -98,8 +98,13 @@ class Rates:
 
     def thrust(self, action: Array, state: WorldState) -> Array:
         """As `Controller.thrust`."""
+        collective, rates = self.demands(action, state)
+        return self.turn(collective, rates, state)
+
+    def demands(self, action: Array, state: WorldState) -> tuple[Array, Parts]:
+        """Collective thrust, N, and body rates, rad/s, that an action asks for."""
         share, *rates = self._scaled(action)
-        return self.turn(self.collective.thrust(share), rates, state)
+        return self.collective.thrust(share), rates
 
     def turn(self, collective: Array, rates: Parts, state: WorldState) -> Array:
         """Thrusts, N, shape (..., R), for a collective thrust, N, and body rates, rad/s."""
@@ -168,26 +173,23 @@ class Attitude(Rates):
     def sizes(self, gains: Gains) -> Numbers:
         return 1.0, gains.most_tilt, gains.most_tilt, gains.most_rate[2]
 
-    def thrust(self, action: Array, state: WorldState) -> Array:
-        """As `Controller.thrust`."""
-        share, roll, pitch, yaw_rate = self._scaled(action)
+    def demands(self, action: Array, state: WorldState) -> tuple[Array, Parts]:
+        """As `Rates.demands`."""
         axes = axes_of(state.quaternion)
+        collective, axis, yaw_rate = self.aimed(action, axes, state)
+        return collective, self.rates_to(axis, yaw_rate, axes)
+
+    def aimed(self, action: Array, axes: Rows, state: WorldState) -> tuple[Array, Parts, Array]:
+        """Collective thrust, N, thrust axis, a unit vector of the world, and yaw rate about the
+        vertical, rad/s, that an action asks for. `axes` are the body's in the world frame.
+        """
+        share, roll, pitch, yaw_rate = self._scaled(action)
         cosine = cos(roll)
         x, y = turned(axes[0], cosine * sin(pitch), -sin(roll))
-        axis = x, y, cosine * cos(pitch)
-        return self.point(self.collective.thrust(share), axis, yaw_rate, axes, state)
-
-    def point(
-        self, collective: Array, axis: Parts, yaw_rate: Array, axes: Rows, state: WorldState
-    ) -> Array:
-        """As `turn`, for a collective thrust, N, and a thrust axis, a unit vector of the world.
-
-        `axes` are the body's axes in the world frame; the yaw rate is about the vertical, rad/s.
-        """
-        return self.turn(collective, self.rates_to(axis, yaw_rate, axes), state)
+        return self.collective.thrust(share), (x, y, cosine * cos(pitch)), yaw_rate
 
     def rates_to(self, axis: Parts, yaw_rate: Array, axes: Rows) -> Parts:
-        """Body rates, rad/s, that `point` asks for."""
+        """Body rates, rad/s, that turn the thrust axis to another, with a yaw rate."""
         x, y, z = times(axes, axis)
         aside = _ASIDE * (z < 0.0)
         # Of the turn by θ about (-y, x, 0) / sin θ: over cos(θ / 2), which is sqrt((1 + z) / 2).
@@ -210,19 +212,19 @@ class Velocity(Attitude):
         level, up = gains.most_velocity
         return level, level, up, gains.most_rate[2]
 
-    def thrust(self, action: Array, state: WorldState) -> Array:
-        """As `Controller.thrust`."""
-        x, y, z, yaw_rate = self._scaled(action)
-        axes = axes_of(state.quaternion)
-        return self.fly((*turned(axes[0], x, y), z), yaw_rate, axes, state)
-
-    def fly(self, velocity: Parts, yaw_rate: Array, axes: Rows, state: WorldState) -> Array:
-        """As `point`, for a velocity in the world frame, m/s."""
+    def aimed(self, action: Array, axes: Rows, state: WorldState) -> tuple[Array, Parts, Array]:
+        """As `Attitude.aimed`."""
+        velocity, yaw_rate = self.moved(action, axes)
         collective, axis = self.aim(velocity, axes, state)
-        return self.point(collective, axis, yaw_rate, axes, state)
+        return collective, axis, yaw_rate
+
+    def moved(self, action: Array, axes: Rows) -> tuple[Parts, Array]:
+        """Velocity in the world frame, m/s, and yaw rate, rad/s, that an action asks for."""
+        x, y, z, yaw_rate = self._scaled(action)
+        return (*turned(axes[0], x, y), z), yaw_rate
 
     def aim(self, velocity: Parts, axes: Rows, state: WorldState) -> tuple[Array, Parts]:
-        """Collective thrust, N, and thrust axis that `fly` asks for."""
+        """Collective thrust, N, and thrust axis for a velocity in the world frame, m/s."""
         gains = self.gains
         gravity = self._gravity
         level, up = gains.most_acceleration
@@ -258,10 +260,9 @@ class Position(Velocity):
         level, up = gains.most_offset
         return level, level, up, math.pi
 
-    def thrust(self, action: Array, state: WorldState) -> Array:
-        """As `Controller.thrust`."""
+    def moved(self, action: Array, axes: Rows) -> tuple[Parts, Array]:
+        """As `Velocity.moved`."""
         x, y, z, heading = self._scaled(action)
-        axes = axes_of(state.quaternion)
         gains = self.gains
         level, up = gains.most_acceleration
         fast, climb = gains.most_velocity
@@ -269,7 +270,7 @@ class Position(Velocity):
         x, y = turned(axes[0], along * x, along * y)
         z = self._gain(_length(z), up, climb) * z
         most = gains.most_rate[2]
-        return self.fly((x, y, z), clip(gains.heading * heading, -most, most), axes, state)
+        return (x, y, z), clip(gains.heading * heading, -most, most)
 
     def _gain(self, distance: Array, acceleration: float, speed: float) -> Array:
         """Velocity over offset, 1/s."""
@@ -301,6 +302,13 @@ def turned(nose: Parts, x: Array, y: Array) -> tuple[Array, Array]:
     c = nose[0] / length
     s = nose[1] / length
     return c * x - s * y, s * x + c * y
+
+
+def tilt_of(axis: Parts, nose: Parts) -> tuple[Array, Array]:
+    """Roll and pitch, rad, of a thrust axis, a unit vector of the world, as of `Attitude`."""
+    x, y, z = axis
+    ahead, left = turned((nose[0], -nose[1]), x, y)
+    return -np.arcsin(clip(left, -1.0, 1.0)), np.arctan2(ahead, z)
 
 
 def _length(x: Array, y: Array = 0.0) -> Array:
