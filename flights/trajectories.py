@@ -240,15 +240,8 @@ def _fly_batch(
 ) -> ByEpisode:
     """At most W episodes, one in each world, by number; those of a lost simulator are missing."""
     drones = len(env.env_spec.agents)
-    used = len(seeds) * drones
-    policies = [copy.deepcopy(policy) for _ in range(used)]
-    for own in policies:
-        if own is not None:
-            own.reset()
-    of_drones = [seed for seed in seeds.values() for _ in range(drones)]
-    env.single_action_space.seed(of_drones[0])
-    spare = [0] * (env.num_envs - used)
-    env.reset(seed=of_drones + spare)
+    policies = _begun(env, policy, seeds)
+    used = len(policies)
     wanted = [array.name for array in env.env_spec.observation if array.name in observations]
     rows = [_row(env, wanted)]
     rewards = []
@@ -257,22 +250,20 @@ def _fly_batch(
     terminated = np.zeros(env.num_envs, bool)
     lost = env.lost
     done = lost | (np.arange(env.num_envs) >= used)
-    frozen = worlds_done(done, drones) if some(done) else None
-    flying = np.flatnonzero(~done).tolist()
-    while flying:
-        chosen = _act(env, policies, flying)
-        env.advance(chosen, frozen=frozen)
-        rows.append(_row(env, wanted))
-        rewards.append(env.rewards)
-        actions.append(chosen)
-        ended = env.terminated | env.truncated
-        if some(ended):
-            lengths[flying] = len(rewards)
-            terminated = terminated | (env.terminated & ~done)
-            lost = lost | (env.lost & ~done)
-            done = done | ended
-            frozen = worlds_done(done, drones)
-            flying = np.flatnonzero(~done).tolist()
+    while flying := np.flatnonzero(~done).tolist():
+        frozen = worlds_done(done, drones) if some(done) else None
+        ended = np.zeros_like(done)
+        while not some(ended):
+            chosen = _act(env, policies, flying)
+            env.advance(chosen, frozen=frozen)
+            rows.append(_row(env, wanted))
+            rewards.append(env.rewards)
+            actions.append(chosen)
+            ended = (env.terminated | env.truncated) & ~done
+        lengths[ended] = len(rewards)
+        terminated = terminated | (env.terminated & ended)
+        lost = lost | (env.lost & ended)
+        done = done | ended
     arrays = {name: np.array([row[name] for row in rows]) for name in rows[0]}
     all_rewards = np.array(rewards)
     all_actions = np.array(actions)
@@ -297,6 +288,20 @@ def _fly_batch(
         )
         flown.setdefault(episode, []).append(trajectory)
     return flown
+
+
+def _begun(
+    env: AdvancingVectorEnv, policy: Policy | None, seeds: Mapping[int, int]
+) -> list[Policy | None]:
+    """Begin an episode in each of the first worlds; policies of their drones."""
+    of_drones = [seed for seed in seeds.values() for _ in env.env_spec.agents]
+    policies = [copy.deepcopy(policy) for _ in of_drones]
+    for own in policies:
+        if own is not None:
+            own.reset()
+    env.single_action_space.seed(of_drones[0])
+    env.reset(seed=of_drones + [0] * (env.num_envs - len(of_drones)))
+    return policies
 
 
 def _row(env: AdvancingVectorEnv, wanted: Sequence[str]) -> Mapping[str, Array]:
