@@ -43,7 +43,7 @@ def slopes_of(agent: VPG | A2C, data: Rollout) -> dict[str, Any]:
         slopes["critic"] = slope[-1, 0]
 
     agent._actor.head.back = head  # type: ignore[method-assign]
-    agent._both.backward = both  # type: ignore[method-assign]
+    agent._both.learn = both  # type: ignore[method-assign]
     agent.gradient(data)
     return slopes
 
