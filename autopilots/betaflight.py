@@ -161,11 +161,11 @@ def _told(link: socket.socket, command: str, end: str = "# ") -> str:
     answer = ""
     deadline = time.monotonic() + ANSWER
     while not answer.endswith(end):
+        if time.monotonic() > deadline:
+            raise TimeoutError(f"no end of its answer to {command!r}")
         try:
             part = link.recv(4096)
         except TimeoutError:
-            if time.monotonic() > deadline:
-                raise
             link.sendall(b"\r\n")  # it may keep its last words until it has more to say
             continue
         if not part:
@@ -199,7 +199,12 @@ class Betaflight:
         self._weight = vehicle.mass * vehicle.gravity
         self._propellers = Propellers(config, vehicle)
         self._pilot = StickPilot(config, vehicle, pilot, mode == "acro")
-        self.order_every = round(self._pilot.period * protocol.RATE)
+        period = 1000.0 * self._pilot.period
+        self.order_every = round(period)
+        if not math.isclose(period, self.order_every):
+            raise InputError(
+                f"policy: expected a control period of whole ms with betaflight, got {period:g} ms"
+            )
         gains = self._pilot.gains
         full = 10.0 * np.clip(np.ceil(np.degrees(gains.most_rate) / 10.0), 1.0, 199.0)
         matches = pilot is not None and pilot.matches

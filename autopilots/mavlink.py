@@ -38,6 +38,7 @@ _TYPES: Final = {4: common.MAV_TYPE_QUADROTOR, 6: common.MAV_TYPE_HEXAROTOR}
 _ACTUATORS: Final = 32  # of a message
 _CELLS: Final = 10
 _UNKNOWN: Final = 65535
+_FASTEST: Final = 32767  # cm/s
 
 
 class MavlinkOut:
@@ -91,7 +92,7 @@ class MavlinkOut:
         beats = now >= self._beat_due
         if beats:
             self._beat_due = now + BEAT_PERIOD
-        time_ms = round(1000.0 * self._steps * self._period)
+        time_ms = round(1000.0 * self._steps * self._period) % 2**32  # after 49 days from 0
         for link, row in zip(self._links, rows, strict=False):
             if beats:
                 _send_beat(link, row)
@@ -124,13 +125,18 @@ def _rows_of(flown: Flown) -> Iterator[Row]:
         yield {name: values[drone] for name, values in telemetry.items()}
 
 
+def _whole(value: float, most: int) -> int:
+    """The nearest number that fits."""
+    return round(min(max(value, -most), most))
+
+
 def _send_beat(link: common.MAVLink, row: Row) -> None:
     kind = _TYPES.get(len(row["thrust"]), common.MAV_TYPE_GENERIC_MULTIROTOR)
     armed = common.MAV_MODE_FLAG_SAFETY_ARMED
     link.heartbeat_send(kind, common.MAV_AUTOPILOT_GENERIC, armed, 0, common.MAV_STATE_ACTIVE)
     if "battery" in row:
         charge, voltage = row["battery"].tolist()
-        cells = [round(1000.0 * voltage)] + (_CELLS - 1) * [_UNKNOWN]
+        cells = [_whole(1000.0 * voltage, _UNKNOWN - 1)] + (_CELLS - 1) * [_UNKNOWN]
         link.battery_status_send(0, 0, 0, 32767, cells, -1, -1, -1, round(100.0 * charge))
 
 
@@ -139,7 +145,7 @@ def _send_pose(link: common.MAVLink, row: Row, time_ms: int) -> None:
     rates = frames.forward_right_down(row["body_rates"])
     position = frames.north_east_down(row["position"])
     velocity = frames.north_east_down(row["velocity"])
-    speeds = [round(100.0 * speed) for speed in velocity]
+    speeds = [_whole(100.0 * speed, _FASTEST) for speed in velocity]
     place = frames.geodetic(row["position"])
     height = round(-1000.0 * position[2])
     heading = round(np.degrees(100.0 * angles[2])) % 36000

@@ -1,10 +1,12 @@
 """Programs of others: each in a folder of its own, that ends with this process."""
 
+import math
 import os
 import shlex
 import shutil
 import socket
 import subprocess
+import threading
 import time
 import weakref
 from collections.abc import Callable, Mapping, Sequence
@@ -19,7 +21,7 @@ HOST = "127.0.0.1"
 ANSWER = 5.0
 """Longest time for an answer, s."""
 _LOG = "output.txt"
-_CORES = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else []
+_CORE = 36  # of the words on a thread that follow its name
 
 
 class Program:
@@ -46,6 +48,7 @@ class Program:
         self.folder = Path(self._closing.enter_context(TemporaryDirectory(prefix="rotorgram-")))
         self._process: subprocess.Popen[bytes] | None = None
         self._there: tuple[str, int] | None = None  # from where it sends
+        self._sent_at = math.inf
         last = most - 1 if apart else 0
         for self.number in range(last + 1):
             moved = self.number * apart
@@ -83,9 +86,8 @@ class Program:
             raise InputError(f"program: expected one that can be run, got {program}")
         if shutil.which("setpriv"):  # it is killed even if this process is
             command = ["setpriv", "--pdeathsig", "KILL", *command]
-        if _CORES and not own_clock:
-            os.sched_setaffinity(0, {_CORES[os.getpid() % len(_CORES)]})  # it inherits that
-            self._closing.callback(os.sched_setaffinity, 0, _CORES)
+        if not own_clock:
+            self._keep_one_core()
         log = self._closing.enter_context((self.folder / _LOG).open("wb"))
         process = subprocess.Popen(
             command,
@@ -99,6 +101,16 @@ class Program:
         self._process = process
         self._closing.callback(_stop, process)
 
+    def _keep_one_core(self) -> None:
+        """Keep this thread, and what it starts, on its core until the end, where the system can."""
+        thread = threading.get_native_id()  # another one may end this
+        with suppress(OSError, AttributeError):
+            cores = os.sched_getaffinity(thread)
+            if len(cores) > 1:
+                words = Path(f"/proc/self/task/{thread}/stat").read_text().rpartition(")")[2]
+                os.sched_setaffinity(thread, {int(words.split()[_CORE])})
+                self._closing.callback(_allow_cores, thread, cores)
+
     def listen(self, port: int) -> socket.socket:
         """A socket that gets what the program sends there."""
         return self._closing.enter_context(bound_socket(self.name, port))
@@ -110,9 +122,12 @@ class Program:
     def receive(self, where: socket.socket | None = None, wait: float = ANSWER) -> bytes:
         """The next datagram, of `link` unless told otherwise.
 
-        Raises `PeerSilent` where none comes, `PeerClosed` if it has ended.
+        Raises `PeerSilent` where none comes, or when those since the last one that was sent were no
+        answer for too long, `PeerClosed` if it has ended.
         """
         where = where or self.link
+        if time.monotonic() > self._sent_at + ANSWER:
+            raise self._silent(ANSWER)
         if where.gettimeout() != wait:  # a call of the system
             where.settimeout(wait)
         with suppress(TimeoutError, ConnectionRefusedError):
@@ -149,6 +164,7 @@ class Program:
     def send(self, datagram: bytes, port: int | None = None) -> None:
         """Send to a port of it; unless told otherwise to that from which it sent first."""
         assert self._there is not None
+        self._sent_at = time.monotonic()
         with suppress(ConnectionRefusedError):  # it has ended: `receive` says so
             self.link.sendto(datagram, (HOST, port) if port else self._there)
 
@@ -168,6 +184,11 @@ def bound_socket(name: str, port: int) -> socket.socket:
             f"{name}: expected that port {port} is free, got one in use: does another run?"
         ) from None
     return bound
+
+
+def _allow_cores(thread: int, cores: set[int]) -> None:
+    with suppress(OSError):  # it has ended, or they were taken away
+        os.sched_setaffinity(thread, cores)
 
 
 def _stop(process: subprocess.Popen[bytes]) -> None:

@@ -1,6 +1,7 @@
 """PX4 in the seat: its program (SITL) in lock-step, flown by setpoints from outside (offboard)."""
 
 import socket
+import time
 from contextlib import suppress
 from pathlib import Path
 from types import SimpleNamespace
@@ -117,9 +118,10 @@ class Px4:
         self._hil.robust_parsing = True
         self._system = 1 + number
         there = (HOST, protocol.ORDERS_PORT + number)
-        self._link = self._program.link
-        self._link.setblocking(False)
-        orders = SimpleNamespace(write=lambda datagram: self._link.sendto(datagram, there))
+        self._link = link = self._program.link
+        link.setblocking(False)
+        # It holds no `self`: the program ends when nobody holds this.
+        orders = SimpleNamespace(write=lambda datagram: link.sendto(datagram, there))
         self._offboard = common.MAVLink(orders, *_WE)
         self._offboard.robust_parsing = True
 
@@ -140,7 +142,10 @@ class Px4:
 
     def _await(self, sent: int) -> None:
         """Take outputs up to those of a reading of that time, µs."""
+        deadline = time.monotonic() + ANSWER
         while self._time < sent:
+            if time.monotonic() > deadline:
+                raise PeerSilent(f"px4: expected outputs of {sent} µs, got those of {self._time}")
             wait = ANSWER if self._time else 1.0 / protocol.RATE
             try:
                 received = self._program.receive(self._peer, wait)
@@ -154,6 +159,7 @@ class Px4:
                 if message.get_type() == "HIL_ACTUATOR_CONTROLS":
                     self._throttles = protocol.throttles(message)[: self._rotors]
                     self._time = message.time_usec
+        self.late += self._time > sent
 
     def _order(self, order: Order) -> None:
         """Send where to fly, and now and then to do so; hear what it says about it."""

@@ -58,7 +58,7 @@ class _Handler(BaseHTTPRequestHandler):
 
     def _steered(self) -> bytes:
         length = self.headers.get("Content-Length", "")
-        size = check("body", _LONGEST, int(length) if length.isdecimal() else length)
+        size = check("body", _LONGEST, int(length[:9]) if length.isdecimal() else length)
         self.server.steer(self.rfile.read(size))
         return self.server.shown
 

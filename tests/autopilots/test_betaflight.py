@@ -111,6 +111,17 @@ def test_rates_in_acro(program: Path) -> None:
         assert last["body_rates"] == pytest.approx(expected, abs=0.4)
 
 
+def test_a_policy_between_two_steps_is_refused() -> None:
+    for period in (0.0004, 0.0025):
+        config = config_of(action="position", control_period=period)
+        start = Start(seated(config, STACK.rate), config.load_vehicle(), "angle", Path("none"))
+        sentence = (
+            f"policy: expected a control period of whole ms with betaflight, got {period * 1e3}"
+        )
+        with pytest.raises(InputError, match=sentence):
+            STACK.make(start, pilot=Pilot(Asks(0.0, 0.0, 0.0, 0.0), env_spec(config)))
+
+
 @needs_program
 def test_a_killed_program_gives_no_thrust() -> None:
     """Its rotors stop, the craft falls, and a sentence tells why."""

@@ -174,6 +174,24 @@ def test_a_heartbeat_and_the_rotors(station: Station) -> None:
     assert battery.voltages == [11_100] + 9 * [65535]
 
 
+def test_what_no_message_can_hold_is_sent_as_its_limit(station: Station) -> None:
+    found = shown(station, velocity=(400.0, -400.0, 1e9), battery=(1.0, 400.0))
+    place = found["GLOBAL_POSITION_INT"]
+    assert (place.vx, place.vy, place.vz) == (-32_767, 32_767, -32_767)
+    assert found["BATTERY_STATUS"].voltages[0] == 65_534
+
+
+def test_the_time_begins_anew_after_49_days(station: Station) -> None:
+    spec = replace(SPEC, control_period=1000.0)
+    clock = Clock()
+    with closing(MavlinkOut(station.address, spec, clock)) as out:
+        for _ in range(4294):
+            out.show([])
+        clock.now += 1.0
+        out.show([telemetry()])
+    assert station.messages("ATTITUDE")[0].time_boot_ms == 4_295_000_000 - 2**32
+
+
 @pytest.mark.parametrize(("speed", "poses"), [(0.2, 500), (1.0, 100), (10.0, 11)])
 def test_poses_and_heartbeats_keep_the_clock_on_the_wall(
     station: Station, speed: float, poses: int

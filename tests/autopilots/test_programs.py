@@ -8,10 +8,14 @@ import socket
 import subprocess
 import sys
 import textwrap
+import threading
 import time
+from collections import deque
+from itertools import islice
 from pathlib import Path
 
 import pytest
+from rotorgram.autopilots import programs
 from rotorgram.autopilots.programs import HOST, Program
 from rotorgram.models import InputError
 from rotorgram.udp.protocol.errors import PeerClosed, PeerSilent
@@ -20,6 +24,13 @@ CORES = """
 import os, socket, sys
 mine = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
 mine.sendto(repr(os.sched_getaffinity(0)).encode(), ("127.0.0.1", int(sys.argv[1])))
+"""
+FLOOD = """
+import socket, sys, time
+mine = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+while True:
+    mine.sendto(b"no answer", ("127.0.0.1", int(sys.argv[1])))
+    time.sleep(0.001)
 """
 ECHO = """
 import os, socket, sys
@@ -78,6 +89,47 @@ def test_who_takes_turns_shares_a_core_until_the_end():
     assert os.sched_getaffinity(0) == before
 
 
+@pytest.mark.parametrize("first", [0, 1])
+def test_the_cores_are_those_of_before_whoever_ends_first(first):
+    before = os.sched_getaffinity(0)
+    running = [started(CORES), started(CORES)]
+    running.pop(first).close()
+    running.append(started(CORES))
+    for program in running:
+        program.close()
+    assert os.sched_getaffinity(0) == before
+
+
+def test_another_thread_gives_the_cores_back():
+    before = os.sched_getaffinity(0)
+    program = started(CORES)
+    other = threading.Thread(target=program.close)
+    other.start()
+    other.join()
+    assert os.sched_getaffinity(0) == before
+
+
+def test_cores_that_the_user_chose_later_are_kept():
+    before = os.sched_getaffinity(0)
+    chosen = {max(before)}
+    os.sched_setaffinity(0, chosen)
+    try:
+        started(CORES).close()
+        assert os.sched_getaffinity(0) == chosen
+    finally:
+        os.sched_setaffinity(0, before)
+
+
+def test_it_runs_where_cores_cannot_be_chosen(monkeypatch):
+    def refuse(*_):
+        raise PermissionError(1, "Operation not permitted")
+
+    monkeypatch.setattr(os, "sched_setaffinity", refuse)
+    program = started(CORES)
+    assert program.meet(any_of).decode() == repr(os.sched_getaffinity(0))
+    program.close()
+
+
 def test_one_with_its_own_clock_runs_where_it_likes():
     before = os.sched_getaffinity(0)
     program = Program("echo", free_port())
@@ -99,6 +151,18 @@ def test_one_that_hangs_is_named():
     program = started("import time; time.sleep(60)")
     with pytest.raises(PeerSilent, match=r"^echo: expected an answer within 0\.1 s, got none$"):
         program.receive(wait=0.1)
+    program.close()
+
+
+def test_one_that_only_talks_is_named(monkeypatch):
+    monkeypatch.setattr(programs, "ANSWER", 0.5)
+    program = started(FLOOD)
+    program.meet(any_of)
+    program.send(b"hello")
+    heard = iter(program.receive, b"an answer")
+    assert next(heard) == b"no answer"
+    with pytest.raises(PeerSilent, match=r"^echo: expected an answer within 0\.5 s, got none$"):
+        deque(islice(heard, 100_000))
     program.close()
 
 

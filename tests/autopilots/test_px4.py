@@ -3,6 +3,7 @@
 import math
 import socket
 import sys
+import tempfile
 from contextlib import ExitStack, closing, suppress
 from itertools import pairwise
 from pathlib import Path
@@ -209,6 +210,49 @@ def test_one_that_does_not_connect(program, monkeypatch):
     monkeypatch.setattr(px4, "CONNECT", 0.2)
     with pytest.raises(PeerSilent, match=r"px4: expected it to connect to port 45\d\d, got"):
         flown(program, "hummingbird")
+
+
+WRONG_TIME = """
+import socket, sys, threading
+from pymavlink.dialects.v20 import common
+peer = socket.create_connection(("127.0.0.1", 4560 + int(sys.argv[2])))
+hil = common.MAVLink(peer.makefile("wb", 0), 1, 1)
+def talk():
+    while {talks}:
+        hil.hil_actuator_controls_send({time}, [{throttle}] * 16, 0, 1)
+threading.Thread(target=talk, daemon=True).start()
+hil.hil_actuator_controls_send({time}, [{throttle}] * 16, 0, 1)
+while peer.recv(65536):
+    pass
+"""
+
+
+def test_outputs_of_another_time_are_late(program):
+    text = WRONG_TIME.format(talks=False, time=2**62, throttle=0.6)
+    program.write_text(f"#!{sys.executable}\n{text}")
+    _, tally = flown(program, "hummingbird", episode_length=10)
+    assert tally.faults == []
+    assert tally.late == tally.steps
+
+
+def test_one_that_repeats_old_outputs_is_named(program, monkeypatch):
+    monkeypatch.setattr(px4, "ANSWER", 0.5)
+    program.write_text(f"#!{sys.executable}\n{WRONG_TIME.format(talks=True, time=5, throttle=0)}")
+    sentence = r"^px4: expected outputs of 4000 µs, got those of 5$"
+    with pytest.raises(PeerSilent, match=sentence):
+        flown(program, "hummingbird")
+
+
+def test_a_seat_that_nobody_holds_ends_its_program(program, monkeypatch):
+    folders = program.parent / "folders"
+    folders.mkdir()
+    monkeypatch.setattr(tempfile, "tempdir", str(folders))
+    config = EnvConfig.from_keywords("rotorgram/Hover-v0", vehicle="hummingbird")
+    config = seated(config, STACK.rate)
+    stack = STACK.make(Start(config, config.load_vehicle(), "offboard", program))
+    assert len(list(folders.iterdir())) == 1
+    del stack
+    assert not list(folders.iterdir())
 
 
 def test_a_port_in_use_is_named(program):

@@ -229,6 +229,13 @@ def test_a_condition_fires_once() -> None:
     assert velocity[first + 1 :] == pytest.approx(2.0)
 
 
+def test_every_number_of_the_telemetry_may_be_a_condition() -> None:
+    """A thrust has a capital letter in its name."""
+    kick = {"kind": "kick", "when": "F1 > 1.0", "impulse": (0.0, 0.0, 20.0)}
+    velocity = speeds(flown([kick], hovering(3)))[:, 2]
+    assert velocity[-1] == pytest.approx(20.0 / MASS, rel=1e-9)
+
+
 def test_an_event_of_one_drone_of_a_swarm() -> None:
     kick = {"kind": "kick", "at": 0.0, "drone": 1, "impulse": (0.01, 0.0, 0.0)}
     config = EnvConfig.from_keywords(
