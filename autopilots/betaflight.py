@@ -15,7 +15,6 @@ from ..agents.policies import Observation
 from ..models import InputError, Vehicle
 from ..models.matrices import right_inverse
 from ..sim.control.gains import Gains
-from ..udp.protocol.errors import PeerSilent
 from .programs import ANSWER, HOST, Program, compiled
 from .protocol import betaflight as protocol
 from .reading import Floats, Order, Propellers, Reading
@@ -141,7 +140,7 @@ class Running(Program):
                 _told(link, "save", "Rebooting")
             memory = (self.folder / _MEMORY).read_bytes()
         except OSError as error:
-            raise PeerSilent(f"betaflight: expected its CLI, got none: {error}") from None
+            raise self.silent(f"its CLI, got none: {error}") from None
         return Firmware(version, memory)
 
     def _connected(self) -> socket.socket:

@@ -38,7 +38,8 @@ _TYPES: Final = {4: common.MAV_TYPE_QUADROTOR, 6: common.MAV_TYPE_HEXAROTOR}
 _ACTUATORS: Final = 32  # of a message
 _CELLS: Final = 10
 _UNKNOWN: Final = 65535
-_FASTEST: Final = 32767  # cm/s
+_FASTEST: Final = 327.0  # m/s, of a message
+_HIGHEST: Final = 65.0  # V, likewise
 
 
 class MavlinkOut:
@@ -125,18 +126,13 @@ def _rows_of(flown: Flown) -> Iterator[Row]:
         yield {name: values[drone] for name, values in telemetry.items()}
 
 
-def _whole(value: float, most: int) -> int:
-    """The nearest number that fits."""
-    return round(min(max(value, -most), most))
-
-
 def _send_beat(link: common.MAVLink, row: Row) -> None:
     kind = _TYPES.get(len(row["thrust"]), common.MAV_TYPE_GENERIC_MULTIROTOR)
     armed = common.MAV_MODE_FLAG_SAFETY_ARMED
     link.heartbeat_send(kind, common.MAV_AUTOPILOT_GENERIC, armed, 0, common.MAV_STATE_ACTIVE)
     if "battery" in row:
         charge, voltage = row["battery"].tolist()
-        cells = [_whole(1000.0 * voltage, _UNKNOWN - 1)] + (_CELLS - 1) * [_UNKNOWN]
+        cells = [round(1000.0 * min(voltage, _HIGHEST))] + (_CELLS - 1) * [_UNKNOWN]
         link.battery_status_send(0, 0, 0, 32767, cells, -1, -1, -1, round(100.0 * charge))
 
 
@@ -145,7 +141,7 @@ def _send_pose(link: common.MAVLink, row: Row, time_ms: int) -> None:
     rates = frames.forward_right_down(row["body_rates"])
     position = frames.north_east_down(row["position"])
     velocity = frames.north_east_down(row["velocity"])
-    speeds = [_whole(100.0 * speed, _FASTEST) for speed in velocity]
+    speeds = [round(100.0 * speed) for speed in np.clip(velocity, -_FASTEST, _FASTEST)]
     place = frames.geodetic(row["position"])
     height = round(-1000.0 * position[2])
     heading = round(np.degrees(100.0 * angles[2])) % 36000

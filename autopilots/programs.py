@@ -21,7 +21,6 @@ HOST = "127.0.0.1"
 ANSWER = 5.0
 """Longest time for an answer, s."""
 _LOG = "output.txt"
-_CORE = 36  # of the words on a thread that follow its name
 
 
 class Program:
@@ -32,6 +31,7 @@ class Program:
         number: From 0: of several programs of one kind. It moves their ports.
         folder: Where it runs.
         link: The socket that gets what the program sends to its simulator.
+        sent_at: When it was sent something, s of the monotonic clock.
     """
 
     def __init__(
@@ -48,7 +48,7 @@ class Program:
         self.folder = Path(self._closing.enter_context(TemporaryDirectory(prefix="rotorgram-")))
         self._process: subprocess.Popen[bytes] | None = None
         self._there: tuple[str, int] | None = None  # from where it sends
-        self._sent_at = math.inf
+        self.sent_at = math.inf
         last = most - 1 if apart else 0
         for self.number in range(last + 1):
             moved = self.number * apart
@@ -107,9 +107,9 @@ class Program:
         with suppress(OSError, AttributeError):
             cores = os.sched_getaffinity(thread)
             if len(cores) > 1:
-                words = Path(f"/proc/self/task/{thread}/stat").read_text().rpartition(")")[2]
-                os.sched_setaffinity(thread, {int(words.split()[_CORE])})
-                self._closing.callback(_allow_cores, thread, cores)
+                os.sched_setaffinity(thread, {sorted(cores)[os.getpid() % len(cores)]})
+                self._closing.enter_context(suppress(OSError))  # the thread may have ended
+                self._closing.callback(os.sched_setaffinity, thread, cores)
 
     def listen(self, port: int) -> socket.socket:
         """A socket that gets what the program sends there."""
@@ -126,16 +126,14 @@ class Program:
         answer for too long, `PeerClosed` if it has ended.
         """
         where = where or self.link
-        if time.monotonic() > self._sent_at + ANSWER:
-            raise self._silent(ANSWER)
         if where.gettimeout() != wait:  # a call of the system
             where.settimeout(wait)
         with suppress(TimeoutError, ConnectionRefusedError):
-            while True:
+            while time.monotonic() < self.sent_at + ANSWER:
                 datagram, sender = where.recvfrom(2048)
                 if where is not self.link or sender == self._there:
                     return datagram
-        raise self._silent(wait)
+        raise self.silent(f"an answer within {wait:g} s, got none")
 
     def meet(self, read: Callable[[bytes], object]) -> bytes:
         """The first datagram on `link` that `read` does not refuse by `InputError`. From then on
@@ -150,21 +148,21 @@ class Program:
                 self._there = sender
                 self.link.connect(sender)
                 return datagram
-        raise self._silent(ANSWER)
+        raise self.silent(f"an answer within {ANSWER:g} s, got none")
 
-    def _silent(self, wait: float) -> Exception:
-        """Why nothing came."""
+    def silent(self, words: str) -> Exception:
+        """Why what was expected did not come: it has ended, or else in words."""
         status = self._process.poll() if self._process else None
         if status is None:
-            return PeerSilent(f"{self.name}: expected an answer within {wait:g} s, got none")
-        words = (self.folder / _LOG).read_text(errors="replace").strip().splitlines()
-        said = words[-1] if words else "it said nothing"
+            return PeerSilent(f"{self.name}: expected {words}")
+        lines = (self.folder / _LOG).read_text(errors="replace").strip().splitlines()
+        said = lines[-1] if lines else "it said nothing"
         return PeerClosed(f"{self.name}: ended with status {status}: {said}")
 
     def send(self, datagram: bytes, port: int | None = None) -> None:
         """Send to a port of it; unless told otherwise to that from which it sent first."""
         assert self._there is not None
-        self._sent_at = time.monotonic()
+        self.sent_at = time.monotonic()
         with suppress(ConnectionRefusedError):  # it has ended: `receive` says so
             self.link.sendto(datagram, (HOST, port) if port else self._there)
 
@@ -184,11 +182,6 @@ def bound_socket(name: str, port: int) -> socket.socket:
             f"{name}: expected that port {port} is free, got one in use: does another run?"
         ) from None
     return bound
-
-
-def _allow_cores(thread: int, cores: set[int]) -> None:
-    with suppress(OSError):  # it has ended, or they were taken away
-        os.sched_setaffinity(thread, cores)
 
 
 def _stop(process: subprocess.Popen[bytes]) -> None:

@@ -27,6 +27,7 @@ from rotorgram.envs.config import EnvConfig
 from rotorgram.envs.registry import env_spec
 from rotorgram.envs.vector import LocalVectorEnv
 from rotorgram.models import InputError
+from rotorgram.udp.protocol.errors import PeerClosed, PeerSilent
 
 PROGRAMS = [Path(path) for path in os.environ.get("ROTORGRAM_BETAFLIGHT", "").split(":") if path]
 STACK = find_stack("betaflight")
@@ -34,6 +35,15 @@ needs_program = pytest.mark.skipif(
     not PROGRAMS, reason="ROTORGRAM_BETAFLIGHT: expected the path of Betaflight's SITL, got none"
 )
 every_program = pytest.mark.parametrize("program", PROGRAMS, ids=lambda path: path.name)
+
+TALKS = """
+import os, socket, time
+port = 5761 + int(os.environ.get("BETAFLIGHT_APART", 0))
+link = socket.create_server(("127.0.0.1", port)).accept()[0]
+while True:
+    link.sendall(b"no end ")
+    time.sleep(0.01)
+"""
 
 
 class Asks:
@@ -120,6 +130,33 @@ def test_a_policy_between_two_steps_is_refused() -> None:
         )
         with pytest.raises(InputError, match=sentence):
             STACK.make(start, pilot=Pilot(Asks(0.0, 0.0, 0.0, 0.0), env_spec(config)))
+
+
+def test_one_that_ends_before_its_cli_says_what_it_said(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("rotorgram.autopilots.betaflight.ANSWER", 0.5)
+    program = tmp_path / "none"
+    program.write_text("#!/bin/sh\necho no memory\nexit 3\n")
+    program.chmod(0o755)
+    config = config_of()
+    start = Start(seated(config, STACK.rate), config.load_vehicle(), "angle", program)
+    with pytest.raises(PeerClosed, match=r"^betaflight: ended with status 3: no memory$"):
+        STACK.make(start)
+
+
+def test_a_cli_that_never_ends_its_answer_is_given_up(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("rotorgram.autopilots.betaflight.ANSWER", 1.0)
+    program = tmp_path / "talks"
+    program.write_text(f"#!{sys.executable}\n{TALKS}")
+    program.chmod(0o755)
+    config = config_of()
+    start = Start(seated(config, STACK.rate), config.load_vehicle(), "angle", program)
+    sentence = r"^betaflight: expected its CLI, got none: no end of its answer to '#'$"
+    with pytest.raises(PeerSilent, match=sentence):
+        STACK.make(start)
 
 
 @needs_program

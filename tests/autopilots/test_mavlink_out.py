@@ -177,8 +177,8 @@ def test_a_heartbeat_and_the_rotors(station: Station) -> None:
 def test_what_no_message_can_hold_is_sent_as_its_limit(station: Station) -> None:
     found = shown(station, velocity=(400.0, -400.0, 1e9), battery=(1.0, 400.0))
     place = found["GLOBAL_POSITION_INT"]
-    assert (place.vx, place.vy, place.vz) == (-32_767, 32_767, -32_767)
-    assert found["BATTERY_STATUS"].voltages[0] == 65_534
+    assert (place.vx, place.vy, place.vz) == (-32_700, 32_700, -32_700)
+    assert found["BATTERY_STATUS"].voltages[0] == 65_000
 
 
 def test_the_time_begins_anew_after_49_days(station: Station) -> None:

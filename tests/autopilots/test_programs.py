@@ -161,7 +161,7 @@ def test_one_that_only_talks_is_named(monkeypatch):
     program.send(b"hello")
     heard = iter(program.receive, b"an answer")
     assert next(heard) == b"no answer"
-    with pytest.raises(PeerSilent, match=r"^echo: expected an answer within 0\.5 s, got none$"):
+    with pytest.raises(PeerSilent, match=r"^echo: expected an answer within 5 s, got none$"):
         deque(islice(heard, 100_000))
     program.close()
 

@@ -14,7 +14,7 @@ from rotorgram.envs.config import EnvConfig
 from rotorgram.envs.vector import LocalVectorEnv
 from rotorgram.flights.trajectories import fly_episodes
 from rotorgram.models import InputError
-from rotorgram.udp.protocol.errors import PeerSilent
+from rotorgram.udp.protocol.errors import PeerClosed, PeerSilent
 
 pytest.importorskip("pymavlink", reason="pymavlink is not installed")
 from pymavlink.dialects.v20 import common
@@ -227,6 +227,13 @@ while peer.recv(65536):
 """
 
 
+def test_one_that_ends_before_it_connects_says_what_it_said(program, monkeypatch):
+    monkeypatch.setattr(px4, "CONNECT", 0.5)
+    program.write_text("#!/bin/sh\necho no model\nexit 3\n")
+    with pytest.raises(PeerClosed, match=r"^px4: ended with status 3: no model$"):
+        flown(program, "hummingbird")
+
+
 def test_outputs_of_another_time_are_late(program):
     text = WRONG_TIME.format(talks=False, time=2**62, throttle=0.6)
     program.write_text(f"#!{sys.executable}\n{text}")
@@ -236,9 +243,9 @@ def test_outputs_of_another_time_are_late(program):
 
 
 def test_one_that_repeats_old_outputs_is_named(program, monkeypatch):
-    monkeypatch.setattr(px4, "ANSWER", 0.5)
+    monkeypatch.setattr("rotorgram.autopilots.programs.ANSWER", 0.5)
     program.write_text(f"#!{sys.executable}\n{WRONG_TIME.format(talks=True, time=5, throttle=0)}")
-    sentence = r"^px4: expected outputs of 4000 µs, got those of 5$"
+    sentence = r"^px4: expected an answer within 5 s, got none$"
     with pytest.raises(PeerSilent, match=sentence):
         flown(program, "hummingbird")
 

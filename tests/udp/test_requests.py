@@ -125,13 +125,19 @@ def test_only_where_the_owner_of_the_simulator_allows_it(allowed: bool) -> None:
 
 
 def test_beyond_this_machine_with_a_key_alone() -> None:
+    sentence = r"is not a loopback address: .* or a key .*, where agents ask for events$"
     for insecure in (False, True):
-        with pytest.raises(InputError, match=r"is not a loopback address: .* or a key"):
+        with pytest.raises(InputError, match=sentence):
             Simulator(
                 HOVER, server=("192.0.2.1", 9), bind=ANY, allow_events=True, insecure=insecure,
                 **OPTIONS,
             )  # fmt: skip
     Simulator(HOVER, server=("192.0.2.1", 9), bind=("0.0.0.0", 0), insecure=True, **OPTIONS).close()
+
+
+def test_text_carries_no_request() -> None:
+    with pytest.raises(InputError, match=r"^allow_events: expected the binary codec, got text$"):
+        Simulator(HOVER, bind=ANY, allow_events=True, codec="text", **OPTIONS)
 
 
 @pytest.mark.parametrize("bits", [2, 8, 1 << 63])

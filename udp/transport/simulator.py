@@ -31,7 +31,7 @@ from ..protocol.party import (
     SeveralAgents,
 )
 from ..protocol.running import FreeRun, FreeRunning
-from .sockets import LONGEST_WAIT, PAUSE, TEXT_WAY_OUT, WAY_OUT, Port, resolve
+from .sockets import EVENTS_WAY_OUT, LONGEST_WAIT, PAUSE, TEXT_WAY_OUT, WAY_OUT, Port, resolve
 from .stepped import GymEnv, GymnasiumWorld, Steppable, make_stepped
 
 if TYPE_CHECKING:
@@ -344,6 +344,10 @@ def _links(
 ) -> list[AgentLink]:
     """A client for each agent, with a session of its own. They share the drones evenly."""
     way_out = TEXT_WAY_OUT if by_text else WAY_OUT
+    if spec.asks:
+        if by_text:
+            raise InputError("allow_events: expected the binary codec, got text")
+        way_out = EVENTS_WAY_OUT
     if not servers:
         raise InputError("agents: expected one address or more, got none")
     drones = worlds * len(spec.agents)

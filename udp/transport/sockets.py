@@ -36,6 +36,7 @@ WAY_OUT = (
     "a key that both sides share (key_file, --key-file), or insecure=True (--insecure) where "
     "everybody who reaches this port may fly the drone"
 )
+EVENTS_WAY_OUT = "a key that both sides share (key_file, --key-file), where agents ask for events"
 TEXT_WAY_OUT = (
     "the binary codec and a key, or insecure=True (--insecure) where everybody who reaches this "
     "port may fly the drone: text cannot be sealed"
