@@ -8,7 +8,6 @@ from ..models.errors import InputError
 
 if TYPE_CHECKING:
     from .seat import Stack, Start
-    from .sticks import Pilot
 
 
 class StackInfo(NamedTuple):
@@ -21,32 +20,41 @@ class StackInfo(NamedTuple):
     """Of its steps, Hz."""
     modes: tuple[str, ...]
     """Ways to fly; the first one unless told otherwise."""
+    takes: tuple[str, ...] = ()
+    """Fields of `Start` that other stacks do not take."""
 
-    def checked_mode(self, mode: str | None) -> str:
-        """One of its modes, its first for None. Raises `InputError`."""
+    def check(self, mode: str | None, **asked: object) -> None:
+        """Refuse a mode that it has not, and fields of `Start` that it does not take. Raises
+        `InputError`.
+        """
         if mode not in (None, *self.modes):
             expected = " or ".join(self.modes)
             raise InputError(f"mode: expected {expected} with {self.name}, got {mode}")
-        return mode or self.modes[0]
+        for name, value in asked.items():
+            if value and name not in self.takes:
+                takers = [one.name for one in STACKS.values() if name in one.takes]
+                raise InputError(f"{name}: expected {' or '.join(takers)}, got {self.name}")
 
-    def make(self, start: "Start", **pilot: "Pilot") -> "Stack":
-        """Begin one, flown by a pilot of ours if it takes one. Raises `InputError` where that
-        fails.
-        """
-        kind: Callable[..., Stack] = getattr(import_module(f".{self.name}", __name__), self.kind)
-        return kind(start, **pilot)
+    def make(self, start: "Start") -> "Stack":
+        """Begin one. Raises `InputError` where that fails."""
+        kind: Callable[[Start], Stack]
+        kind = getattr(import_module(f".{self.name}", __name__), self.kind)
+        return kind(start)
 
 
 STACKS: Final[Mapping[str, StackInfo]] = {
     one.name: one
     for one in (
         StackInfo("ardupilot", "ArduPilot", 400.0, ("guided", "auto")),
-        StackInfo("betaflight", "Betaflight", 1000.0, ("angle", "acro")),
+        StackInfo(
+            "betaflight", "Betaflight", 1000.0, ("angle", "acro"), takes=("real_time", "policy")
+        ),
         StackInfo(
             "crazyflie",
             "Crazyflie",
             1000.0,
             ("auto", "pid", "mellinger", "indi", "brescianini", "policy"),
+            takes=("real_time",),
         ),
         StackInfo("px4", "Px4", 250.0, ("offboard",)),
     )

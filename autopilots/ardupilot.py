@@ -5,7 +5,6 @@ Its clock is ours from the first step on: the flight has the same bits each time
 
 import math
 import tomllib
-from contextlib import suppress
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Final
@@ -16,11 +15,11 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from ..agents.policies import Observation
 from ..models import InputError, Vehicle
 from ..sim.control.gains import Gains
-from .programs import HOST, Program
+from .programs import HOST, Program, arrived
 from .protocol import ardupilot as protocol
 from .protocol.frames import ORIGIN, geodetic, north_east_down
 from .reading import Floats, Order, Propellers, Reading
-from .seat import Start
+from .seat import Stack, Start
 
 PERIOD: Final = 0.01
 """Time that its filters and its loop need, s."""
@@ -103,13 +102,14 @@ def tuning(vehicle: Vehicle, propellers: Propellers) -> dict[str, float]:
     return found
 
 
-class ArduPilot:
+class ArduPilot(Stack):
     """A program of ArduCopter's SITL. Its ports are free ones: many run side by side."""
 
+    why = "its estimate has not begun"
+    order_every = TALK_EVERY
+
     def __init__(self, start: Start) -> None:
-        config, vehicle, mode, program, real_time = start
-        if real_time:
-            raise InputError("real_time: expected lock-step with ardupilot, got real time")
+        config, vehicle, mode, path, *_ = start
         self._auto = mode == "auto"
         self._goal = np.full(3, np.inf)
         frame_class, frame_type, self._order = motor_order(vehicle)
@@ -117,8 +117,6 @@ class ArduPilot:
         values |= {"FRAME_CLASS": frame_class, "FRAME_TYPE": frame_type}
         if "rangefinder" in config.sensors:
             values["RNGFND1_TYPE"] = 100
-        self._steps = 0
-        self.order_every = TALK_EVERY
         self._origin: Floats | None = None
         self._optional: dict[str, object] = {}
         if any(config.effects.wind):
@@ -129,20 +127,17 @@ class ArduPilot:
             (_ARM, 1, _FORCED),
             (_TAKE_OFF, 0, 0, 0, 0, 0, 0, 1),
         ]
-        self.ready = False
-        self.why = "its estimate has not begun"
-        self.late = 0
-        self._program = Program("ardupilot", 0)
-        self._talk = self._program.listen(0)
-        self._talk.setblocking(False)
+        program = Program("ardupilot", 0)
+        super().__init__(program, len(self._order))
+        self._talk = program.listen(0)
         self._mav = mavlink.MAVLink(SimpleNamespace(write=self._talk.send), srcSystem=255)
         self._mav.robust_parsing = True
         self._heard = False
         lines = [f"{name} {value:.6g}\n" for name, value in values.items()]
-        (self._program.folder / "vehicle.parm").write_text("".join(lines))
-        ports = [link.getsockname()[1] for link in (self._program.link, self._talk)]
-        self._program.start(
-            program,
+        (program.folder / "vehicle.parm").write_text("".join(lines))
+        ports = [link.getsockname()[1] for link in (program.link, self._talk)]
+        program.start(
+            path,
             [
                 f"--model=JSON:{HOST}",
                 f"--sim-port-out={ports[0]}",
@@ -150,43 +145,37 @@ class ArduPilot:
                 *_OPTIONS,
             ],
         )
-        self._frame = protocol.servos(self._program.meet(protocol.servos)).frame
+        self._frame = protocol.servos(program.meet(protocol.servos)).frame
 
-    def step(self, reading: Reading, order: Order | None, observation: Observation) -> Floats:
-        """As `Stack.step`."""
+    def _tell(self, reading: Reading, order: Order | None, observation: Observation) -> None:
         if self._origin is None:
             self._origin = reading.position
         if self._steps % TALK_EVERY == 0:
             self._listen()
             if self._heard:
-                self._tell(order, self._origin)
-        self._steps += 1
+                self._talk_of(order, self._origin)
         if "rangefinder" in observation:
             self._optional["rng_1"] = observation["rangefinder"].item()
         self._program.send(protocol.state_line(reading, self._optional))
-        throttles = np.zeros(len(self._order))
-        throttles[self._order] = self._receive()[: len(self._order)]
-        return throttles
 
-    def _receive(self) -> Floats:
+    def _read(self, datagram: bytes) -> Floats | None:
         """Throttles of the next frame. A frame comes again after a second of silence."""
-        while True:
-            servos = protocol.servos(self._program.receive())
-            if servos.frame > self._frame:
-                break
+        servos = protocol.servos(datagram)
+        if servos.frame <= self._frame:
+            return None
         self.late += servos.frame > self._frame + 1
         self._frame = servos.frame
-        return servos.throttles
+        throttles = np.zeros(len(self._order))
+        throttles[self._order] = servos.throttles[: len(self._order)]
+        return throttles
 
     def _listen(self) -> None:
         """Take its messages."""
         data = b""
-        with suppress(BlockingIOError):
-            while True:
-                datagram, there = self._talk.recvfrom(2048)
-                self._talk.connect(there)
-                data += datagram
-                self._heard = True
+        for datagram, there in arrived(self._talk):
+            self._talk.connect(there)
+            data += datagram
+            self._heard = True
         for message in self._mav.parse_buffer(data) or ():
             match message.get_type():
                 case "STATUSTEXT":
@@ -201,7 +190,7 @@ class ArduPilot:
                 case "MISSION_ACK" if message.type == 0:
                     self._commands = [(_START_MISSION,)]
 
-    def _tell(self, order: Order | None, origin: Floats) -> None:
+    def _talk_of(self, order: Order | None, origin: Floats) -> None:
         """One message: a command until it is accepted, then the goal."""
         if not self.ready and self._steps % ASK_EVERY == 0:
             self._command(_SEND_EVERY, _REPORT, 100_000)
@@ -231,7 +220,3 @@ class ArduPilot:
     def _command(self, number: int, *values: int) -> None:
         filled = (*values, *[0] * 7)[:7]
         self._mav.command_long_send(1, 1, number, 0, *filled)
-
-    def close(self) -> None:
-        """As `Stack.close`."""
-        self._program.close()

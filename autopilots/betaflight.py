@@ -3,7 +3,7 @@
 import math
 import socket
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import closing
 from functools import cache
 from pathlib import Path
@@ -15,11 +15,11 @@ from ..agents.policies import Observation
 from ..models import InputError, Vehicle
 from ..models.matrices import right_inverse
 from ..sim.control.gains import Gains
-from .programs import ANSWER, HOST, Program, compiled
+from .programs import ANSWER, HOST, Program
 from .protocol import betaflight as protocol
 from .reading import Floats, Order, Propellers, Reading
-from .seat import Start
-from .sticks import Pilot, StickPilot
+from .seat import Stack, Start
+from .sticks import StickPilot
 
 BOOT: Final = 8.0
 """Time until it arms, s of its clock: the gyro's calibration, and the grace after power on."""
@@ -35,7 +35,6 @@ MOST_MOTORS: Final = 8
 _LOWEST: Final = 1050.0  # µs: throttle 0
 _ARM, _ANGLE = 4, 5  # channels
 _AXES = ("roll", "pitch", "yaw")
-_BEHIND: Final = 0.005  # s: a longer delay is not made up for
 _MEMORY: Final = "eeprom.bin"
 _SOURCE: Final = Path(__file__).with_name("betaflight_lockstep.c")
 _CONFIG: Final = """\
@@ -103,55 +102,25 @@ class Firmware(NamedTuple):
     memory: bytes
 
 
-class Running(Program):
-    """A program of Betaflight that may run: in lock-step with ports of its own."""
+def new_program(lockstep: bool) -> tuple[Program, dict[str, str]]:
+    """A program that may run, in lock-step with ports of its own, and its environment."""
+    ports = (protocol.STATE_PORT, protocol.STICKS_PORT)
+    program = Program("betaflight", protocol.MOTORS_PORT, ports, APART if lockstep else 0)
+    if not lockstep:
+        return program, {}
+    library = program.library(_SOURCE)
+    return program, {"LD_PRELOAD": library, "BETAFLIGHT_APART": str(program.moved)}
 
-    def __init__(self, path: Path | None, lockstep: bool) -> None:
-        ports = (protocol.STATE_PORT, protocol.STICKS_PORT)
-        super().__init__("betaflight", protocol.MOTORS_PORT, ports, APART if lockstep else 0)
-        self.apart = self.number * APART
-        self._path = path
-        self._environment: dict[str, str] = {}
-        if lockstep:
-            library = compiled(_SOURCE, self.folder)
-            self._environment = {"LD_PRELOAD": str(library), "BETAFLIGHT_APART": str(self.apart)}
 
-    def fly(self, memory: bytes, motors: int) -> None:
-        """Start it with a memory, and wait until it has booted."""
-        (self.folder / _MEMORY).write_bytes(memory)
-        environment = {**self._environment, "BETAFLIGHT_LOCKSTEP": "1"}
-        self.start(self._path, environment=environment, own_clock=not self._environment)
-        self.meet(lambda datagram: protocol.throttles(datagram, motors))
-
-    def tell(self, datagram: bytes, port: int) -> None:
-        """Send to one of its ports, given as of the first program."""
-        self.send(datagram, port + self.apart)
-
-    def configured(self, commands: Sequence[str]) -> Firmware:
-        """Start it, and give commands to its CLI. Raises `InputError`, or `PeerSilent`."""
-        self.start(self._path, environment=self._environment)
+def _connected(port: int, deadline: float) -> socket.socket:
+    """A connection to its CLI."""
+    while True:
         try:
-            with self._connected() as link:
-                _told(link, "#")  # it wants silence behind this, 0.1 s of its clock
-                link.settimeout(0.05)
-                version = protocol.version_of(_told(link, "version"))
-                for command in commands:
-                    _told(link, command)
-                _told(link, "save", "Rebooting")
-            memory = (self.folder / _MEMORY).read_bytes()
-        except OSError as error:
-            raise self.silent(f"its CLI, got none: {error}") from None
-        return Firmware(version, memory)
-
-    def _connected(self) -> socket.socket:
-        deadline = time.monotonic() + ANSWER
-        while True:
-            try:
-                return socket.create_connection((HOST, protocol.CLI_PORT + self.apart), 0.5)
-            except (ConnectionRefusedError, TimeoutError):  # it does not listen yet
-                if self._path and time.monotonic() > deadline:
-                    raise
-                time.sleep(0.01)
+            return socket.create_connection((HOST, port), 0.5)
+        except (ConnectionRefusedError, TimeoutError):  # it does not listen yet
+            if time.monotonic() > deadline:
+                raise
+            time.sleep(0.01)
 
 
 def _told(link: socket.socket, command: str, end: str = "# ") -> str:
@@ -177,28 +146,46 @@ def _told(link: socket.socket, command: str, end: str = "# ") -> str:
 
 @cache
 def configured(path: Path | None, commands: tuple[str, ...], lockstep: bool) -> Firmware:
-    """What a program becomes by commands of its CLI. It runs once for this."""
-    running = Running(path, lockstep)
-    with closing(running):
-        return running.configured(commands)
+    """What a program becomes by commands of its CLI. It runs once for this.
+
+    Raises `InputError`, or `PeerSilent`.
+    """
+    program, environment = new_program(lockstep)
+    with closing(program):
+        program.start(path, environment=environment)
+        deadline = time.monotonic() + ANSWER if path else math.inf
+        try:
+            with _connected(protocol.CLI_PORT + program.moved, deadline) as link:
+                _told(link, "#")  # it wants silence behind this, 0.1 s of its clock
+                link.settimeout(0.05)
+                version = protocol.version_of(_told(link, "version"))
+                for command in commands:
+                    _told(link, command)
+                _told(link, "save", "Rebooting")
+            return Firmware(version, (program.folder / _MEMORY).read_bytes())
+        except OSError as error:
+            raise program.silent(f"its CLI, got none: {error}") from None
 
 
-class Betaflight:
+class Betaflight(Stack):
     """A program of Betaflight's SITL, with the switches ARM and ANGLE."""
 
-    def __init__(self, start: Start, pilot: Pilot | None = None) -> None:
-        config, vehicle, mode, program, real_time = start
-        self._rotors = vehicle.num_rotors
-        if self._rotors > MOST_MOTORS:
+    boot = BOOT
+    why = "it does not arm"
+
+    def __init__(self, start: Start) -> None:
+        config, vehicle, mode, path, real_time, pilot = start
+        rotors = vehicle.num_rotors
+        if rotors > MOST_MOTORS:
             raise InputError(
                 f"betaflight: expected at most {MOST_MOTORS} rotors, "
-                f"got {vehicle.name} with {self._rotors}"
+                f"got {vehicle.name} with {rotors}"
             )
         self._high = float(vehicle.thrust_high.sum())
         self._weight = vehicle.mass * vehicle.gravity
         self._propellers = Propellers(config, vehicle)
         self._pilot = StickPilot(config, vehicle, pilot, mode == "acro")
-        period = 1000.0 * self._pilot.period
+        period = self._pilot.period / start.period
         self.order_every = round(period)
         if not math.isclose(period, self.order_every):
             raise InputError(
@@ -208,61 +195,35 @@ class Betaflight:
         full = 10.0 * np.clip(np.ceil(np.degrees(gains.most_rate) / 10.0), 1.0, 199.0)
         matches = pilot is not None and pilot.matches
         commands = tuple(configuration(vehicle, self._propellers, gains, full, matches))
-        version, memory = configured(program, commands, not real_time)
+        version, memory = configured(path, commands, not real_time)
         if not self._pilot.acro:
             full[:2] = FULL_ANGLE
         self._full = np.radians(full) * (1.0, 1.0, -1.0)
         self._yaw = protocol.yaw_of(version)
         self._channels = [1500.0, 1500.0, 1000.0, 1500.0, 1000.0, 1000.0]
-        self._steps = 0
         self._ordered = math.inf  # time of the first order
-        self._throttles = np.zeros(self._rotors)
-        self.ready = False
-        self.why = "it does not arm"
-        self.late = 0
-        self._program = Running(program, not real_time)
-        self._program.fly(memory, self._rotors)
-        self._due = self._heard = math.nan
-        if real_time:
-            self._due = self._heard = time.monotonic()
-            self._program.link.setblocking(False)
+        self._real_time = real_time
+        program, environment = new_program(not real_time)
+        super().__init__(program, rotors)
+        (program.folder / _MEMORY).write_bytes(memory)
+        environment["BETAFLIGHT_LOCKSTEP"] = "1"
+        own_period = start.period if real_time else None
+        program.start(path, environment=environment, period=own_period)
+        program.meet(self._read)
 
-    def step(self, reading: Reading, order: Order | None, observation: Observation) -> Floats:
-        """As `Stack.step`."""
-        self.ready = reading.time >= BOOT
+    def _tell(self, reading: Reading, order: Order | None, observation: Observation) -> None:
         if order is not None:
             self._move_sticks(reading, order, observation)
         if self._steps % self.order_every == 0:
             sticks = protocol.sticks_packet(reading.time, self._channels)
-            self._program.tell(sticks, protocol.STICKS_PORT)
-        self._steps += 1
+            self._program.send(sticks, protocol.STICKS_PORT)
         # A stock program would take stamps for the speed of time: its own is constant.
-        stamp = reading.time if math.isnan(self._due) else 1.0
+        stamp = 1.0 if self._real_time else reading.time
         state = protocol.state_packet(reading, stamp, self._yaw)
-        self._program.tell(state, protocol.STATE_PORT)
-        received = self._program.receive() if math.isnan(self._due) else self._newest()
-        if received is not None:
-            self._throttles = protocol.throttles(received, self._rotors)
-        else:
-            self.late += 1
-        return self._throttles
+        self._program.send(state, protocol.STATE_PORT)
 
-    def _newest(self) -> bytes | None:
-        """What came last in a period of real time."""
-        self._due = max(self._due, time.monotonic() - _BEHIND) + 1.0 / protocol.RATE
-        time.sleep(max(self._due - time.monotonic(), 0.0))
-        newest = None
-        while True:
-            try:
-                newest = self._program.link.recv(2048)
-            except BlockingIOError:
-                break
-        now = time.monotonic()
-        if newest is not None:
-            self._heard = now
-        elif now - self._heard > ANSWER:
-            return self._program.receive(wait=0.1)
-        return newest
+    def _read(self, datagram: bytes) -> Floats:
+        return protocol.throttles(datagram, len(self._throttles))
 
     def _move_sticks(self, reading: Reading, order: Order, observation: Observation) -> None:
         self._ordered = min(self._ordered, reading.time)
@@ -278,7 +239,3 @@ class Betaflight:
         roll, pitch, yaw = (1500.0 + 500.0 * demands[1:] / self._full).tolist()
         height = _LOWEST + (2000.0 - _LOWEST) * (throttle - IDLE) / (1.0 - IDLE)
         self._channels[:4] = roll, pitch, height, yaw
-
-    def close(self) -> None:
-        """As `Stack.close`."""
-        self._program.close()

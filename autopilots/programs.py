@@ -9,10 +9,11 @@ import subprocess
 import threading
 import time
 import weakref
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, suppress
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Final, TypeVar
 
 from ..models import InputError
 from ..udp.protocol.errors import PeerClosed, PeerSilent
@@ -20,7 +21,12 @@ from ..udp.protocol.errors import PeerClosed, PeerSilent
 HOST = "127.0.0.1"
 ANSWER = 5.0
 """Longest time for an answer, s."""
+_MOST = 16
+"""Of one kind that run side by side."""
+_BEHIND: Final = 0.005  # s: a longer delay of real time is not made up for
 _LOG = "output.txt"
+
+Answer = TypeVar("Answer")
 
 
 class Program:
@@ -28,17 +34,16 @@ class Program:
     process. Its folder is removed then.
 
     Attributes:
-        number: From 0: of several programs of one kind. It moves their ports.
+        moved: What is added to its ports: several programs of one kind have others.
         folder: Where it runs.
         link: The socket that gets what the program sends to its simulator.
         sent_at: When it was sent something, s of the monotonic clock.
     """
 
-    def __init__(
-        self, name: str, own: int, others: Sequence[int] = (), apart: int = 0, most: int = 16
-    ) -> None:
-        """It is the first of `most` programs whose ports on the loopback interface are free: `own`,
-        of `link`, and `others`, which the program will bind, each moved by `apart` a program.
+    def __init__(self, name: str, own: int, others: Sequence[int] = (), apart: int = 0) -> None:
+        """It is the first of several programs whose ports on the loopback interface are free:
+        `own`, of `link`, and `others`, which the program will bind, each moved by `apart` a
+        program.
 
         Raises `InputError` if none are free.
         """
@@ -49,15 +54,16 @@ class Program:
         self._process: subprocess.Popen[bytes] | None = None
         self._there: tuple[str, int] | None = None  # from where it sends
         self.sent_at = math.inf
-        last = most - 1 if apart else 0
-        for self.number in range(last + 1):
-            moved = self.number * apart
+        self._period: float | None = None
+        self._due = self._heard = 0.0
+        last = (_MOST - 1) * apart
+        for self.moved in range(0, last + 1, apart or 1):
             try:
-                self.link = self.listen(own + moved)
+                self.link = self.listen(own)
                 for port in others:
-                    bound_socket(name, port + moved).close()
+                    bound_socket(name, port + self.moved).close()
             except InputError:
-                if self.number == last:
+                if self.moved == last:
                     raise
             else:
                 return
@@ -67,14 +73,15 @@ class Program:
         program: Path | str | None,
         arguments: Sequence[str] = (),
         environment: Mapping[str, str] = {},
-        own_clock: bool = False,
+        period: float | None = None,
     ) -> None:
         """Run it in the folder, its output in a file there. Without a program, say how the user
         starts it, and wait for it.
 
-        One without its own clock runs on one core with this thread: they take turns, and a core
-        that slept would wake late for each turn.
+        With a period of its steps, s, it keeps its own clock. Without one it runs on one core with
+        this thread: they take turns, and a core that slept would wake late for each turn.
         """
+        self._period = period
         if program is None:
             around = [f"{name}={shlex.quote(value)}" for name, value in environment.items()]
             words = " ".join([*around, shlex.join([self.name, *arguments])])
@@ -86,7 +93,7 @@ class Program:
             raise InputError(f"program: expected one that can be run, got {program}")
         if shutil.which("setpriv"):  # it is killed even if this process is
             command = ["setpriv", "--pdeathsig", "KILL", *command]
-        if not own_clock:
+        if period is None:
             self._keep_one_core()
         log = self._closing.enter_context((self.folder / _LOG).open("wb"))
         process = subprocess.Popen(
@@ -112,8 +119,10 @@ class Program:
                 self._closing.callback(os.sched_setaffinity, thread, cores)
 
     def listen(self, port: int) -> socket.socket:
-        """A socket that gets what the program sends there."""
-        return self._closing.enter_context(bound_socket(self.name, port))
+        """A socket that gets what the program sends there. It does not wait."""
+        bound = self._closing.enter_context(bound_socket(self.name, port + self.moved))
+        bound.setblocking(False)
+        return bound
 
     def keep(self, connection: socket.socket) -> socket.socket:
         """A connection to the program, which is closed with it."""
@@ -147,8 +156,33 @@ class Program:
                 read(datagram)
                 self._there = sender
                 self.link.connect(sender)
+                self.link.setblocking(False)
+                self._due = self._heard = time.monotonic()
                 return datagram
         raise self.silent(f"an answer within {ANSWER:g} s, got none")
+
+    def answer(self, read: Callable[[bytes], Answer | None]) -> Answer | None:
+        """Its answer to a step, as `read` takes it from a datagram on `link`; None of another one.
+
+        In lock-step the first answer is waited for. By its own clock a step takes its period of
+        real time, and the answer is the newest that came in it, or None. Raises as `receive`.
+        """
+        answer = None
+        if self._period is None:
+            while answer is None:
+                answer = read(self.receive())
+            return answer
+        self._due = max(self._due, time.monotonic() - _BEHIND) + self._period
+        time.sleep(max(self._due - time.monotonic(), 0.0))
+        for datagram, sender in arrived(self.link):
+            newer = read(datagram) if sender == self._there else None
+            answer = answer if newer is None else newer
+        now = time.monotonic()
+        if answer is not None:
+            self._heard = now
+        elif now - self._heard > ANSWER:
+            raise self.silent(f"an answer within {ANSWER:g} s, got none")
+        return answer
 
     def silent(self, words: str) -> Exception:
         """Why what was expected did not come: it has ended, or else in words."""
@@ -160,15 +194,36 @@ class Program:
         return PeerClosed(f"{self.name}: ended with status {status}: {said}")
 
     def send(self, datagram: bytes, port: int | None = None) -> None:
-        """Send to a port of it; unless told otherwise to that from which it sent first."""
+        """Send to a port of it, before that is moved; unless told otherwise to that from which it
+        sent first.
+        """
         assert self._there is not None
         self.sent_at = time.monotonic()
         with suppress(ConnectionRefusedError):  # it has ended: `receive` says so
-            self.link.sendto(datagram, (HOST, port) if port else self._there)
+            self.link.sendto(datagram, (HOST, port + self.moved) if port else self._there)
+
+    def library(self, source: Path) -> str:
+        """Path of a shared library of a C file, in the folder. Raises `InputError`."""
+        compiler = shutil.which("cc") or shutil.which("gcc")
+        if compiler is None:
+            raise InputError(
+                "autopilot: expected a C compiler for lock-step, got none: install gcc"
+            )
+        library = str(self.folder / f"{source.stem}.so")
+        words = (compiler, "-O2", "-shared", "-fPIC", "-o", library, source, "-ldl", "-lpthread")
+        subprocess.run(words, check=True)
+        return library
 
     def close(self) -> None:
         """End it. It may be called again."""
         self._end()
+
+
+def arrived(link: socket.socket) -> Iterator[tuple[bytes, tuple[str, int]]]:
+    """Datagrams that have come to a socket that does not wait, with their senders."""
+    with suppress(BlockingIOError, ConnectionError):
+        while True:
+            yield link.recvfrom(2048)
 
 
 def bound_socket(name: str, port: int) -> socket.socket:
@@ -187,14 +242,3 @@ def bound_socket(name: str, port: int) -> socket.socket:
 def _stop(process: subprocess.Popen[bytes]) -> None:
     process.kill()  # one that waits for its simulator takes no other signal
     process.wait()
-
-
-def compiled(source: Path, folder: Path) -> Path:
-    """A shared library of a C file, in a folder. Raises `InputError`."""
-    compiler = shutil.which("cc") or shutil.which("gcc")
-    if compiler is None:
-        raise InputError("autopilot: expected a C compiler for lock-step, got none: install gcc")
-    library = folder / f"{source.stem}.so"
-    words = (compiler, "-O2", "-shared", "-fPIC", "-o", library, source, "-ldl", "-lpthread")
-    subprocess.run(words, check=True)
-    return library

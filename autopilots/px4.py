@@ -2,7 +2,6 @@
 
 import socket
 import time
-from contextlib import suppress
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Final
@@ -14,10 +13,10 @@ from ..agents.policies import Observation
 from ..models import InputError, Vehicle
 from ..sim.control.gains import LEAD, Gains
 from ..udp.protocol.errors import PeerClosed, PeerSilent
-from .programs import ANSWER, HOST, Program
+from .programs import ANSWER, HOST, Program, arrived
 from .protocol import px4 as protocol
 from .reading import Floats, Order, Propellers, Reading
-from .seat import Start
+from .seat import Stack, Start
 
 BOOT: Final = 5.0
 """Time until it gets orders, s of its clock: its estimate has to settle first."""
@@ -78,7 +77,7 @@ def parameters(vehicle: Vehicle, propellers: Propellers) -> dict[str, float]:
     return found
 
 
-class Px4:
+class Px4(Stack):
     """A program of PX4's SITL, the model `none_iris` with the parameters of the vehicle.
 
     It connects, and gets sensors 250 times a second of its clock. While it boots it gives no
@@ -86,76 +85,84 @@ class Px4:
     step waits for those of its reading.
     """
 
+    boot = BOOT
+    why = "it does not arm"
+    order_every = ORDER_EVERY
+
     def __init__(self, start: Start) -> None:
-        config, vehicle, _, program, _ = start
-        self._rotors = vehicle.num_rotors
-        self._throttles = np.zeros(self._rotors)
+        config, vehicle, _, path, *_ = start
+        self._sent = 0  # time of the latest reading, µs
         self._time = 0  # of the latest outputs, µs; 0 before the first
-        self._steps = 0
-        self.order_every = ORDER_EVERY
-        self.ready = False
-        self.why = "it does not arm"
-        self.late = 0
-        self._program = Program("px4", protocol.OFFBOARD_PORT, (protocol.ORDERS_PORT,), apart=1)
-        number = self._program.number
+        program = Program("px4", protocol.OFFBOARD_PORT, (protocol.ORDERS_PORT,), apart=1)
+        super().__init__(program, vehicle.num_rotors)
+        number = program.moved
         port = protocol.PORT + number
-        root = program.parent.parent if program else _BUILD
+        root = path.parent.parent if path else _BUILD
         arguments = ["-i", str(number), "-d", str(root / "etc")]
         settings = parameters(vehicle, Propellers(config, vehicle)).items()
         environment = {f"PX4_PARAM_{name}": f"{value:.7g}" for name, value in settings}
         environment["PX4_SIM_MODEL"] = "none_iris"
         with _listening(port) as server:
-            server.settimeout(CONNECT if program else None)
-            self._program.start(program, arguments, environment)
+            server.settimeout(CONNECT if path else None)
+            program.start(path, arguments, environment)
             try:
-                self._peer = self._program.keep(server.accept()[0])
+                self._peer = program.keep(server.accept()[0])
             except TimeoutError:
-                raise self._program.silent(f"it to connect to port {port}, got nothing") from None
+                raise program.silent(f"it to connect to port {port}, got nothing") from None
         self._peer.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         self._hil = common.MAVLink(SimpleNamespace(write=self._peer.sendall), *_WE)
         self._hil.robust_parsing = True
         self._system = 1 + number
         there = (HOST, protocol.ORDERS_PORT + number)
-        self._link = link = self._program.link
-        link.setblocking(False)
-        # It holds no `self`: the program ends when nobody holds this.
+        link = program.link  # and no `self`: the program ends when nobody holds this
         orders = SimpleNamespace(write=lambda datagram: link.sendto(datagram, there))
         self._offboard = common.MAVLink(orders, *_WE)
         self._offboard.robust_parsing = True
 
     def step(self, reading: Reading, order: Order | None, observation: Observation) -> Floats:
         """As `Stack.step`."""
-        self.ready = reading.time >= BOOT
-        if order is not None:
-            self._order(order)
         try:
-            if self._steps % GPS_EVERY == 0:
-                self._hil.send(protocol.fix(reading))
-            self._hil.send(protocol.sensors(reading))
-            self._await(protocol.microseconds(reading))
+            return super().step(reading, order, observation)
         except (BrokenPipeError, ConnectionResetError):
             raise PeerClosed("px4: expected outputs, got the end of its connection") from None
-        self._steps += 1
-        return self._throttles
 
-    def _await(self, sent: int) -> None:
-        """Take outputs up to those of a reading of that time, µs."""
+    def _tell(self, reading: Reading, order: Order | None, observation: Observation) -> None:
+        if order is not None:
+            self._order(order)
+        if self._steps % GPS_EVERY == 0:
+            self._hil.send(protocol.fix(reading))
+        self._hil.send(protocol.sensors(reading))
+        self._sent = protocol.microseconds(reading)
         self._program.sent_at = time.monotonic()
-        while self._time < sent:
+
+    def _answer(self) -> Floats | None:
+        """As of `Stack`. Before its first outputs none are waited for; those of a later time come
+        too early for their step.
+        """
+        while self._time < self._sent:
             wait = ANSWER if self._time else 1.0 / protocol.RATE
             try:
                 received = self._program.receive(self._peer, wait)
             except PeerSilent:
                 if self._time:
                     raise
-                return
+                return self._throttles
             if not received:
                 raise ConnectionResetError
-            for message in self._hil.parse_buffer(received) or ():
-                if message.get_type() == "HIL_ACTUATOR_CONTROLS":
-                    self._throttles = protocol.throttles(message)[: self._rotors]
-                    self._time = message.time_usec
-        self.late += self._time > sent
+            throttles = self._read(received)
+            if throttles is not None:
+                self._throttles = throttles
+        return self._throttles if self._time == self._sent else None
+
+    def _read(self, datagram: bytes) -> Floats | None:
+        throttles = None
+        for message in self._hil.parse_buffer(datagram) or ():
+            if message.get_type() == "HIL_ACTUATOR_CONTROLS":
+                outputs = protocol.throttles(message)
+                self._time = message.time_usec
+                if self._time >= self._sent:
+                    throttles = outputs[: len(self._throttles)]
+        return throttles
 
     def _order(self, order: Order) -> None:
         """Send where to fly, and now and then to do so; hear what it says about it."""
@@ -166,16 +173,11 @@ class Px4:
             return
         for request in protocol.requests(self._system):
             self._offboard.send(request)
-        with suppress(BlockingIOError):
-            while True:
-                for message in self._offboard.parse_buffer(self._link.recv(2048)) or ():
-                    if message.get_type() == "STATUSTEXT":
-                        begun = self.why if message.chunk_seq else ""
-                        self.why = begun + message.text.rstrip()
-
-    def close(self) -> None:
-        """As `Stack.close`."""
-        self._program.close()
+        for datagram, _ in arrived(self._program.link):
+            for message in self._offboard.parse_buffer(datagram) or ():
+                if message.get_type() == "STATUSTEXT":
+                    begun = self.why if message.chunk_seq else ""
+                    self.why = begun + message.text.rstrip()
 
 
 def _listening(port: int) -> socket.socket:

@@ -2,10 +2,12 @@
 do to an env of the level `rotors`.
 """
 
+import math
+from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol, Self
+from typing import TYPE_CHECKING, Any, NamedTuple, Self
 
 import numpy as np
 
@@ -15,7 +17,12 @@ from ..envs.spec import EnvSpec
 from ..models import InputError, Vehicle
 from ..sim.control import RotorThrust
 from ..udp.protocol.errors import PeerClosed, PeerSilent
+from .programs import Program
 from .reading import Floats, Instruments, Order, Propellers, Reading, exact, heading_of
+
+if TYPE_CHECKING:
+    from . import StackInfo
+    from .sticks import Pilot
 
 LONGEST_STAND = 120.0
 """Time on the ground after which a program that lifts nothing is given up, s of its clock."""
@@ -23,17 +30,26 @@ LIFTED = 0.9
 """Thrust over the weight at which the craft leaves its stand."""
 
 
-class Stack(Protocol):
-    """A program that runs, as the seat sees it."""
+class Stack(ABC):
+    """A program that runs. A kind of it says how it starts, what it is told in a step, and what it
+    answers.
+    """
 
-    ready: bool
+    boot = math.inf
+    """Time from which on it takes orders, s of its clock, for one that does not say so itself."""
+    ready = False
     """Whether it takes orders."""
     why: str
     """Why it is not ready, or does not lift."""
-    late: int
+    late = 0
     """Steps that were not in lock-step: its outputs were not those of the step's reading."""
     order_every: int
     """Steps from one order to the next."""
+
+    def __init__(self, program: Program, rotors: int) -> None:
+        self._program = program
+        self._steps = 0
+        self._throttles: Floats = np.zeros(rotors)
 
     def step(self, reading: Reading, order: Order | None, observation: Observation) -> Floats:
         """Throttle of each rotor, 0 to 1, shape (R,), after one period of the program's clock.
@@ -41,9 +57,31 @@ class Stack(Protocol):
         An order comes with each `order_every`-th step from when it is ready, and with it the
         observation as a pilot has it. Before the first its rotors stay off.
         """
+        self.ready = self.ready or reading.time >= self.boot
+        self._tell(reading, order, observation)
+        self._steps += 1
+        throttles = self._answer()
+        if throttles is None:
+            self.late += 1
+        else:
+            self._throttles = throttles
+        return self._throttles
+
+    @abstractmethod
+    def _tell(self, reading: Reading, order: Order | None, observation: Observation) -> None:
+        """Send what belongs to a step."""
+
+    def _answer(self) -> Floats | None:
+        """Throttles of the step, shape (R,); None if it is late."""
+        return self._program.answer(self._read)
+
+    @abstractmethod
+    def _read(self, datagram: bytes) -> Floats | None:
+        """Throttles of the step in what came; None if they are not there. Raises `InputError`."""
 
     def close(self) -> None:
         """End the program."""
+        self._program.close()
 
 
 class Start(NamedTuple):
@@ -58,6 +96,32 @@ class Start(NamedTuple):
     """What to run; None where the user runs it."""
     real_time: bool = False
     """Whether the program keeps its own clock."""
+    policy: "Pilot | None" = None
+    """What moves the sticks in place of our loops."""
+
+    @classmethod
+    def of(
+        cls,
+        stack: "StackInfo",
+        config: EnvConfig,
+        mode: str | None = None,
+        program: Path | None = None,
+        real_time: bool = False,
+        policy: "Pilot | None" = None,
+    ) -> Self:
+        """Of a flight in an env, in the stack's first mode for None. Raises `InputError` for what
+        it does not take.
+        """
+        stack.check(mode, real_time=real_time, policy=policy)
+        flight = seated(config, stack.rate)
+        vehicle = flight.load_vehicle()
+        return cls(flight, vehicle, mode or stack.modes[0], program, real_time, policy)
+
+    @property
+    def period(self) -> float:
+        """Of the program's steps, s."""
+        assert self.config.control_period is not None
+        return self.config.control_period
 
 
 MakeStack = Callable[[Start], Stack]

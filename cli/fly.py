@@ -4,7 +4,6 @@ import time
 from collections import deque
 from collections.abc import Iterator
 from contextlib import AbstractContextManager, closing
-from functools import partial
 from hashlib import blake2b
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -15,8 +14,8 @@ from ..models import InputError
 from ._flags import Count, EnvFlags, MavlinkFlags
 
 if TYPE_CHECKING:
-    from ..autopilots import StackInfo
-    from ..autopilots.seat import MakeStack, Tally
+    from ..autopilots.seat import Tally
+    from ..autopilots.sticks import Pilot
     from ..envs.config import EnvConfig
     from ..flights.trajectories import Flights
 
@@ -43,7 +42,7 @@ class Fly(EnvFlags, MavlinkFlags):
     """What moves Betaflight's sticks in place of our loops: a checkpoint, the folder of a training,
     or a controller."""
     real_time: bool = False
-    """Let the program keep its own clock. Late steps are counted."""
+    """Let the program of Betaflight or the Crazyflie keep its own clock. Late steps are counted."""
     seeds: Count = 1
     """Episodes to fly, each by a program that begins anew, from seeds that no training uses."""
     record: Path | None = None
@@ -56,7 +55,7 @@ class Fly(EnvFlags, MavlinkFlags):
     def run(self) -> int:
         """Fly, and print the means, the speed and the flights' hash."""
         from ..autopilots import find_stack
-        from ..autopilots.seat import Seat, Start, seated
+        from ..autopilots.seat import Seat, Start
         from ..flights.filming import Film, FilmTrack, film
         from ..flights.trajectories import fly_episodes
         from ..rendering.film import check_film
@@ -66,10 +65,10 @@ class Fly(EnvFlags, MavlinkFlags):
         if self.film:
             check_film(self.film, settings.width, settings.height, settings.fps)
         stack = find_stack(self.autopilot)
-        mode = stack.checked_mode(self.mode)
-        command, make = self._steered(stack)
-        config = seated(command.env_config(), stack.rate)
-        start = Start(config, config.load_vehicle(), mode, self._program(), self.real_time)
+        program = self._program()
+        command, pilot = self._steered()
+        env_config = command.env_config()
+        start = Start.of(stack, env_config, self.mode, program, self.real_time, pilot)
         flown: Flights = []
 
         def flights() -> "Iterator[Flights]":
@@ -78,8 +77,8 @@ class Fly(EnvFlags, MavlinkFlags):
                 flown.extend(flight)
                 yield flight
 
-        with self._opened(config) as env:
-            seat = Seat(env.env_spec, start, make)
+        with self._opened(start.config) as env:
+            seat = Seat(env.env_spec, start, stack.make)
             began = time.perf_counter()
             with mavlink_out(self, env.env_spec) as env.observer:
                 if self.view:
@@ -91,16 +90,14 @@ class Fly(EnvFlags, MavlinkFlags):
             taken = time.perf_counter() - began
         self._report(flown, seat.tally, seat.tally.steps / stack.rate / taken)
         if self.film:
-            track = FilmTrack(name=self.autopilot, trajectories=flown, drones=config.drones)
+            track = FilmTrack(name=self.autopilot, trajectories=flown, drones=env_config.drones)
             print(f"film       {self.film} ({film(self.film, [track], settings)} pictures)")
         return int(bool(seat.tally.faults))
 
-    def _steered(self, stack: "StackInfo") -> "tuple[Fly, MakeStack]":
-        """The command with the env of the policy that moves the sticks, and what begins a stack."""
+    def _steered(self) -> "tuple[Fly, Pilot | None]":
+        """The command with the env of the policy that moves the sticks, and that policy."""
         if not self.policy:
-            return self, stack.make
-        if stack.name != "betaflight":
-            raise InputError(f"policy: expected betaflight, which has sticks, got {stack.name}")
+            return self, None
         from ..autopilots.sticks import Pilot
         from ..envs.registry import env_spec
         from ._env import pilot_of
@@ -108,8 +105,7 @@ class Fly(EnvFlags, MavlinkFlags):
         command, policy = pilot_of(self, self.policy)
         if policy is None:
             raise InputError("policy: expected a checkpoint or a controller, got random")
-        pilot = Pilot(policy, env_spec(command.env_config()))
-        return command, partial(stack.make, pilot=pilot)
+        return command, Pilot(policy, env_spec(command.env_config()))
 
     def _program(self) -> Path | None:
         if self.connect and self.program:

@@ -72,6 +72,7 @@ class Timed:
         self._clock = clock
         self.close = stack.close
 
+    order_every = property(lambda self: self._stack.order_every)
     ready = property(lambda self: self._stack.ready)
     why = property(lambda self: self._stack.why)
     late = property(lambda self: self._stack.late)

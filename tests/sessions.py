@@ -52,8 +52,7 @@ def record(stack_name, program):
     send, receive, meet, start = Program.send, Program.receive, Program.meet, Program.start
 
     def sent(self, datagram, port=None):
-        base = port - self.number * 10 if port else 0
-        events.append((base, datagram))
+        events.append((port or 0, datagram))
         send(self, datagram, port)
 
     def received(self, *arguments, **keywords):

@@ -20,8 +20,6 @@ MOTORS_PORT: Final = 9001
 STATE_PORT: Final = 9003
 STICKS_PORT: Final = 9004
 CLI_PORT: Final = 5761
-RATE: Final = 1000.0
-"""Rate of states and motors, Hz: that of its gyro."""
 YAW: Final = {(2026, 6): 1.0, (0, 0): -1.0}
 """Sign of the gyro's z, by the first release, year and month; the newest first."""
 

@@ -16,8 +16,6 @@ PORT: Final = 19950
 """Of the simulator."""
 CLIENT_PORT: Final = 19850
 """Where clients such as cflib look for a Crazyflie."""
-RATE: Final = 1000.0
-"""Of IMU readings and motors, Hz."""
 HELLO: Final = b"\xf3"
 """The firmware's first packet, and the answer."""
 NOTHING: Final = b"\xff"

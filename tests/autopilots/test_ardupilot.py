@@ -251,12 +251,6 @@ def test_a_mission_to_the_goal(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
     assert lines[6:] == [f"item 1 {north} {east} 3.0", "300"]
 
 
-def test_real_time_is_refused(tmp_path: Path) -> None:
-    start = start_of(tmp_path)._replace(real_time=True)
-    with pytest.raises(InputError, match="real_time: expected lock-step with ardupilot"):
-        ArduPilot(start)
-
-
 def test_without_its_program_the_motors_stop(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

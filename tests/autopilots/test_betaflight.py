@@ -11,7 +11,6 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from contextlib import closing
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -20,8 +19,8 @@ from commands import Capsys, output, refused
 from numpy.typing import NDArray
 from rotorgram.agents.policies import Observation
 from rotorgram.autopilots import find_stack
-from rotorgram.autopilots.betaflight import Running
-from rotorgram.autopilots.seat import Seat, Start, seated
+from rotorgram.autopilots.betaflight import configured
+from rotorgram.autopilots.seat import Seat, Start
 from rotorgram.autopilots.sticks import Pilot
 from rotorgram.envs.config import EnvConfig
 from rotorgram.envs.registry import env_spec
@@ -68,12 +67,10 @@ def flown(
     program: Path, config: EnvConfig, mode: str, pilot: Pilot | None = None
 ) -> Iterator[tuple[Seat, dict[str, NDArray[np.float64]]]]:
     """The seat and the telemetry after each step of a flight."""
-    inner = seated(config, STACK.rate)
-    start = Start(inner, inner.load_vehicle(), mode, program)
-    make = partial(STACK.make, pilot=pilot) if pilot else STACK.make
-    with closing(LocalVectorEnv(inner, 1, autoreset_mode="Disabled")) as env:
+    start = Start.of(STACK, config, mode, program, policy=pilot)
+    with closing(LocalVectorEnv(start.config, 1, autoreset_mode="Disabled")) as env:
         observations, _ = env.reset(seed=5)
-        with closing(Seat(env.env_spec, start, make)) as seat:
+        with closing(Seat(env.env_spec, start, STACK.make)) as seat:
             while True:
                 action = seat.act({name: array[0] for name, array in observations.items()})
                 observations, _, terminated, truncated, _ = env.step(action[np.newaxis])
@@ -124,12 +121,13 @@ def test_rates_in_acro(program: Path) -> None:
 def test_a_policy_between_two_steps_is_refused() -> None:
     for period in (0.0004, 0.0025):
         config = config_of(action="position", control_period=period)
-        start = Start(seated(config, STACK.rate), config.load_vehicle(), "angle", Path("none"))
+        pilot = Pilot(Asks(0.0, 0.0, 0.0, 0.0), env_spec(config))
+        start = Start.of(STACK, config, "angle", Path("none"))._replace(policy=pilot)
         sentence = (
             f"policy: expected a control period of whole ms with betaflight, got {period * 1e3}"
         )
         with pytest.raises(InputError, match=sentence):
-            STACK.make(start, pilot=Pilot(Asks(0.0, 0.0, 0.0, 0.0), env_spec(config)))
+            STACK.make(start)
 
 
 def test_one_that_ends_before_its_cli_says_what_it_said(
@@ -140,7 +138,7 @@ def test_one_that_ends_before_its_cli_says_what_it_said(
     program.write_text("#!/bin/sh\necho no memory\nexit 3\n")
     program.chmod(0o755)
     config = config_of()
-    start = Start(seated(config, STACK.rate), config.load_vehicle(), "angle", program)
+    start = Start.of(STACK, config, "angle", program)
     with pytest.raises(PeerClosed, match=r"^betaflight: ended with status 3: no memory$"):
         STACK.make(start)
 
@@ -153,7 +151,7 @@ def test_a_cli_that_never_ends_its_answer_is_given_up(
     program.write_text(f"#!{sys.executable}\n{TALKS}")
     program.chmod(0o755)
     config = config_of()
-    start = Start(seated(config, STACK.rate), config.load_vehicle(), "angle", program)
+    start = Start.of(STACK, config, "angle", program)
     sentence = r"^betaflight: expected its CLI, got none: no end of its answer to '#'$"
     with pytest.raises(PeerSilent, match=sentence):
         STACK.make(start)
@@ -190,9 +188,8 @@ def test_two_programs_fly_side_by_side() -> None:
 
 @needs_program
 def test_a_command_that_its_cli_refuses() -> None:
-    refusal = pytest.raises(InputError, match="expected that it takes 'set nonsense = 1', got")
-    with closing(Running(PROGRAMS[0], lockstep=True)) as running, refusal:
-        running.configured(("set nonsense = 1",))
+    with pytest.raises(InputError, match="expected that it takes 'set nonsense = 1', got"):
+        configured(PROGRAMS[0], ("set nonsense = 1",), lockstep=True)
 
 
 @needs_program
@@ -210,7 +207,7 @@ def test_only_betaflight_has_sticks(capsys: Capsys, tmp_path: Path) -> None:
     program = tmp_path / "program"
     program.touch()
     words = ("fly", "crazyflie", "--program", program, "--policy", "geometric")
-    assert "policy: expected betaflight, which has sticks" in refused(capsys, *words)
+    assert "policy: expected betaflight, got crazyflie" in refused(capsys, *words)
 
 
 @needs_program

@@ -3,13 +3,12 @@
 import math
 import socket
 import struct
-from pathlib import Path
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from rotorgram.autopilots.betaflight import Running, configuration
+from rotorgram.autopilots.betaflight import configuration, new_program
 from rotorgram.autopilots.protocol import betaflight as protocol
 from rotorgram.autopilots.reading import Propellers, Reading
 from rotorgram.envs.config import EnvConfig
@@ -138,4 +137,4 @@ def test_a_port_in_use_is_refused() -> None:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
         other.bind(("127.0.0.1", protocol.STATE_PORT))
         with pytest.raises(InputError, match="expected that port 9003 is free, got one in use"):
-            Running(Path("betaflight"), lockstep=False)
+            new_program(lockstep=False)

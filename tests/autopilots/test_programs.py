@@ -134,7 +134,7 @@ def test_one_with_its_own_clock_runs_where_it_likes():
     before = os.sched_getaffinity(0)
     program = Program("echo", free_port())
     words = ["-c", CORES, str(program.link.getsockname()[1])]
-    program.start(sys.executable, words, own_clock=True)
+    program.start(sys.executable, words, period=0.01)
     assert program.meet(any_of).decode() == repr(before)
     assert os.sched_getaffinity(0) == before
     program.close()
@@ -189,13 +189,13 @@ def test_the_next_program_has_other_ports():
     port = free_port()
     first = Program("echo", port, apart=7)
     second = Program("echo", port, apart=7)
-    assert (first.number, second.number) == (0, 1)
+    assert (first.moved, second.moved) == (0, 7)
     assert second.link.getsockname()[1] == port + 7
     with pytest.raises(InputError, match=f"expected that port {port} is free, got one in use"):
         Program("echo", port)
     first.close()
     third = Program("echo", port, apart=7)
-    assert third.number == 0
+    assert third.moved == 0
     second.close()
     third.close()
 
@@ -269,6 +269,62 @@ def test_only_the_program_is_heard():
     with pytest.raises(PeerSilent):
         program.receive(wait=0.1)
     program.close()
+
+
+def answers(text, words, period=None):
+    """What a program says in reply to words, a step each: its text after 'say: '."""
+    program = Program("echo", free_port())
+    port = program.link.getsockname()[1]
+    program.start(sys.executable, ["-c", text, str(port)], period=period)
+    program.meet(any_of)
+
+    def read(datagram):
+        return datagram[5:] if datagram.startswith(b"say: ") else None
+
+    for word in words:
+        program.send(word)
+        yield program.answer(read)
+    program.close()
+
+
+def test_in_lock_step_each_answer_is_waited_for():
+    slow = "    import time; time.sleep(0.05)\n    mine.sendto(b'say: ' + data, there)\n"
+    assert list(answers(ECHO + slow, [b"one", b"two"])) == [b"one", b"two"]
+
+
+def test_by_its_own_clock_the_newest_of_a_period_counts_and_none_is_late():
+    period = 0.2
+    counts = ECHO.replace(
+        "    mine.sendto(data, there)",
+        "    for one in range(3 * int(data)): mine.sendto(b'say: %d' % one, there)",
+    )
+    began = time.monotonic()
+    assert list(answers(counts, [b"1", b"0", b"2"], period)) == [b"2", None, b"5"]
+    assert time.monotonic() - began >= 3 * period
+
+
+def test_by_its_own_clock_too_only_the_program_is_heard():
+    program = Program("echo", free_port())
+    here = program.link.getsockname()
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
+
+        def read(datagram):
+            other.sendto(b"hostile", here)  # before the link is connected
+
+        program.start(sys.executable, ["-c", ECHO, str(here[1])], period=0.2)
+        program.meet(read)
+        assert program.answer(any_of) is None
+        program.send(b"hello")
+        assert program.answer(any_of) == b"hello"
+    program.close()
+
+
+def test_one_with_its_own_clock_that_says_no_more_is_named(monkeypatch):
+    monkeypatch.setattr("rotorgram.autopilots.programs.ANSWER", 0.3)
+    dead = answers(ECHO, 100 * [b"end"], 0.01)
+    assert [next(dead) for _ in range(10)] == 10 * [None]
+    with pytest.raises(PeerClosed, match=r"^echo: ended with status -9: it said nothing$"):
+        list(dead)
 
 
 def test_one_that_is_killed_is_named():

@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 import pytest
+from rotorgram.autopilots import find_stack
 from rotorgram.autopilots.reading import Propellers, exact
 from rotorgram.autopilots.seat import LONGEST_STAND, Seat, Start, seated
 from rotorgram.envs.config import EnvConfig
@@ -183,6 +184,23 @@ def test_a_flight_lasts_as_long_as_the_task_and_reads_exactly():
     own = exact({"gps": {"rate": 10}})
     assert own["gps"] == {"rate": 10}
     assert set(own["imu"].values()) == {0.0}
+
+
+@pytest.mark.parametrize("name", ["ardupilot", "px4"])
+def test_a_stack_without_a_clock_of_its_own_is_refused_in_real_time(name):
+    config = EnvConfig.from_keywords("rotorgram/Hover-v0")
+    sentence = f"^real_time: expected betaflight or crazyflie, got {name}$"
+    with pytest.raises(InputError, match=sentence):
+        Start.of(find_stack(name), config, real_time=True)
+
+
+def test_a_start_has_the_stack_s_first_mode_and_rate():
+    config = EnvConfig.from_keywords("rotorgram/Hover-v0")
+    start = Start.of(find_stack("px4"), config)
+    assert start.mode == "offboard"
+    assert start.period == 0.004
+    with pytest.raises(InputError, match=r"^mode: expected offboard with px4, got angle$"):
+        Start.of(find_stack("px4"), config, "angle")
 
 
 def test_a_task_without_a_goal_is_refused():
