@@ -23,20 +23,19 @@ class StackInfo(NamedTuple):
     takes: tuple[str, ...] = ()
     """Fields of `Start` that other stacks do not take."""
 
-    def check(self, mode: str | None, **asked: object) -> None:
-        """Refuse a mode that it has not, and fields of `Start` that it does not take. Raises
-        `InputError`.
-        """
-        if mode not in (None, *self.modes):
+    def check(self, start: "Start") -> None:
+        """Raise `InputError` for what it does not take."""
+        if start.mode not in self.modes:
             expected = " or ".join(self.modes)
-            raise InputError(f"mode: expected {expected} with {self.name}, got {mode}")
-        for name, value in asked.items():
-            if value and name not in self.takes:
+            raise InputError(f"mode: expected {expected} with {self.name}, got {start.mode}")
+        for name in ("real_time", "policy"):
+            if getattr(start, name) and name not in self.takes:
                 takers = [one.name for one in STACKS.values() if name in one.takes]
                 raise InputError(f"{name}: expected {' or '.join(takers)}, got {self.name}")
 
     def make(self, start: "Start") -> "Stack":
         """Begin one. Raises `InputError` where that fails."""
+        self.check(start)
         kind: Callable[[Start], Stack]
         kind = getattr(import_module(f".{self.name}", __name__), self.kind)
         return kind(start)

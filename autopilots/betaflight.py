@@ -185,7 +185,7 @@ class Betaflight(Stack):
         self._weight = vehicle.mass * vehicle.gravity
         self._propellers = Propellers(config, vehicle)
         self._pilot = StickPilot(config, vehicle, pilot, mode == "acro")
-        period = self._pilot.period / start.period
+        period = 1000.0 * self._pilot.period
         self.order_every = round(period)
         if not math.isclose(period, self.order_every):
             raise InputError(
@@ -207,7 +207,7 @@ class Betaflight(Stack):
         super().__init__(program, rotors)
         (program.folder / _MEMORY).write_bytes(memory)
         environment["BETAFLIGHT_LOCKSTEP"] = "1"
-        own_period = start.period if real_time else None
+        own_period = config.control_period if real_time else None
         program.start(path, environment=environment, period=own_period)
         program.meet(self._read)
 

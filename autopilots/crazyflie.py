@@ -98,7 +98,7 @@ class Crazyflie(Stack):
         if real_time:
             environment["ROTORGRAM_OWN_CLOCK"] = "1"
         words = [str(protocol.PORT + program.moved), HOST]
-        own_period = start.period if real_time else None
+        own_period = config.control_period if real_time else None
         program.start(path, words, environment, own_period)
         program.meet(protocol.check_greeting)
         program.send(protocol.HELLO)

@@ -21,7 +21,6 @@ from .programs import Program
 from .reading import Floats, Instruments, Order, Propellers, Reading, exact, heading_of
 
 if TYPE_CHECKING:
-    from . import StackInfo
     from .sticks import Pilot
 
 LONGEST_STAND = 120.0
@@ -98,30 +97,6 @@ class Start(NamedTuple):
     """Whether the program keeps its own clock."""
     policy: "Pilot | None" = None
     """What moves the sticks in place of our loops."""
-
-    @classmethod
-    def of(
-        cls,
-        stack: "StackInfo",
-        config: EnvConfig,
-        mode: str | None = None,
-        program: Path | None = None,
-        real_time: bool = False,
-        policy: "Pilot | None" = None,
-    ) -> Self:
-        """Of a flight in an env, in the stack's first mode for None. Raises `InputError` for what
-        it does not take.
-        """
-        stack.check(mode, real_time=real_time, policy=policy)
-        flight = seated(config, stack.rate)
-        vehicle = flight.load_vehicle()
-        return cls(flight, vehicle, mode or stack.modes[0], program, real_time, policy)
-
-    @property
-    def period(self) -> float:
-        """Of the program's steps, s."""
-        assert self.config.control_period is not None
-        return self.config.control_period
 
 
 MakeStack = Callable[[Start], Stack]

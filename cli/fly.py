@@ -55,7 +55,7 @@ class Fly(EnvFlags, MavlinkFlags):
     def run(self) -> int:
         """Fly, and print the means, the speed and the flights' hash."""
         from ..autopilots import find_stack
-        from ..autopilots.seat import Seat, Start
+        from ..autopilots.seat import Seat, Start, seated
         from ..flights.filming import Film, FilmTrack, film
         from ..flights.trajectories import fly_episodes
         from ..rendering.film import check_film
@@ -65,10 +65,12 @@ class Fly(EnvFlags, MavlinkFlags):
         if self.film:
             check_film(self.film, settings.width, settings.height, settings.fps)
         stack = find_stack(self.autopilot)
-        program = self._program()
+        mode = self.mode or stack.modes[0]
         command, pilot = self._steered()
-        env_config = command.env_config()
-        start = Start.of(stack, env_config, self.mode, program, self.real_time, pilot)
+        config = seated(command.env_config(), stack.rate)
+        vehicle = config.load_vehicle()
+        start = Start(config, vehicle, mode, self._program(), self.real_time, pilot)
+        stack.check(start)
         flown: Flights = []
 
         def flights() -> "Iterator[Flights]":
@@ -77,7 +79,7 @@ class Fly(EnvFlags, MavlinkFlags):
                 flown.extend(flight)
                 yield flight
 
-        with self._opened(start.config) as env:
+        with self._opened(config) as env:
             seat = Seat(env.env_spec, start, stack.make)
             began = time.perf_counter()
             with mavlink_out(self, env.env_spec) as env.observer:
@@ -90,7 +92,7 @@ class Fly(EnvFlags, MavlinkFlags):
             taken = time.perf_counter() - began
         self._report(flown, seat.tally, seat.tally.steps / stack.rate / taken)
         if self.film:
-            track = FilmTrack(name=self.autopilot, trajectories=flown, drones=env_config.drones)
+            track = FilmTrack(name=self.autopilot, trajectories=flown, drones=config.drones)
             print(f"film       {self.film} ({film(self.film, [track], settings)} pictures)")
         return int(bool(seat.tally.faults))
 

@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from rotorgram.agents import load
 from rotorgram.agents.policies import Observation
 from rotorgram.autopilots import find_stack
-from rotorgram.autopilots.seat import Seat, Start
+from rotorgram.autopilots.seat import Seat, Start, seated
 from rotorgram.autopilots.sticks import Pilot
 from rotorgram.envs.config import EnvConfig
 from rotorgram.envs.registry import env_spec
@@ -57,8 +57,9 @@ def flown(
 ) -> list[Trajectory]:
     """Flights of Betaflight. Raises an error if a step was not in lock-step."""
     stack = find_stack("betaflight")
-    start = Start.of(stack, config, mode, program, policy=pilot)
-    with closing(LocalVectorEnv(start.config, 1, autoreset_mode="Disabled")) as env:
+    seated_config = seated(config, stack.rate)
+    start = Start(seated_config, config.load_vehicle(), mode, program, policy=pilot)
+    with closing(LocalVectorEnv(seated_config, 1, autoreset_mode="Disabled")) as env:
         seat = Seat(env.env_spec, start, stack.make)
         flights = fly_episodes(env, seat, episodes, "final")
     if seat.tally.late or seat.tally.faults:

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from rotorgram.agents.policies import Observation
 from rotorgram.autopilots import find_stack
 from rotorgram.autopilots.betaflight import configured
-from rotorgram.autopilots.seat import Seat, Start
+from rotorgram.autopilots.seat import Seat, Start, seated
 from rotorgram.autopilots.sticks import Pilot
 from rotorgram.envs.config import EnvConfig
 from rotorgram.envs.registry import env_spec
@@ -67,8 +67,9 @@ def flown(
     program: Path, config: EnvConfig, mode: str, pilot: Pilot | None = None
 ) -> Iterator[tuple[Seat, dict[str, NDArray[np.float64]]]]:
     """The seat and the telemetry after each step of a flight."""
-    start = Start.of(STACK, config, mode, program, policy=pilot)
-    with closing(LocalVectorEnv(start.config, 1, autoreset_mode="Disabled")) as env:
+    inner = seated(config, STACK.rate)
+    start = Start(inner, inner.load_vehicle(), mode, program, policy=pilot)
+    with closing(LocalVectorEnv(inner, 1, autoreset_mode="Disabled")) as env:
         observations, _ = env.reset(seed=5)
         with closing(Seat(env.env_spec, start, STACK.make)) as seat:
             while True:
@@ -122,7 +123,8 @@ def test_a_policy_between_two_steps_is_refused() -> None:
     for period in (0.0004, 0.0025):
         config = config_of(action="position", control_period=period)
         pilot = Pilot(Asks(0.0, 0.0, 0.0, 0.0), env_spec(config))
-        start = Start.of(STACK, config, "angle", Path("none"))._replace(policy=pilot)
+        flight = seated(config, STACK.rate)
+        start = Start(flight, config.load_vehicle(), "angle", Path("none"), policy=pilot)
         sentence = (
             f"policy: expected a control period of whole ms with betaflight, got {period * 1e3}"
         )
@@ -138,7 +140,7 @@ def test_one_that_ends_before_its_cli_says_what_it_said(
     program.write_text("#!/bin/sh\necho no memory\nexit 3\n")
     program.chmod(0o755)
     config = config_of()
-    start = Start.of(STACK, config, "angle", program)
+    start = Start(seated(config, STACK.rate), config.load_vehicle(), "angle", program)
     with pytest.raises(PeerClosed, match=r"^betaflight: ended with status 3: no memory$"):
         STACK.make(start)
 
@@ -151,7 +153,7 @@ def test_a_cli_that_never_ends_its_answer_is_given_up(
     program.write_text(f"#!{sys.executable}\n{TALKS}")
     program.chmod(0o755)
     config = config_of()
-    start = Start.of(STACK, config, "angle", program)
+    start = Start(seated(config, STACK.rate), config.load_vehicle(), "angle", program)
     sentence = r"^betaflight: expected its CLI, got none: no end of its answer to '#'$"
     with pytest.raises(PeerSilent, match=sentence):
         STACK.make(start)

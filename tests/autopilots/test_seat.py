@@ -189,18 +189,18 @@ def test_a_flight_lasts_as_long_as_the_task_and_reads_exactly():
 @pytest.mark.parametrize("name", ["ardupilot", "px4"])
 def test_a_stack_without_a_clock_of_its_own_is_refused_in_real_time(name):
     config = EnvConfig.from_keywords("rotorgram/Hover-v0")
+    stack = find_stack(name)
+    start = Start(config, config.load_vehicle(), stack.modes[0], None, real_time=True)
     sentence = f"^real_time: expected betaflight or crazyflie, got {name}$"
     with pytest.raises(InputError, match=sentence):
-        Start.of(find_stack(name), config, real_time=True)
+        stack.make(start)
 
 
-def test_a_start_has_the_stack_s_first_mode_and_rate():
+def test_a_mode_of_another_stack_is_refused():
     config = EnvConfig.from_keywords("rotorgram/Hover-v0")
-    start = Start.of(find_stack("px4"), config)
-    assert start.mode == "offboard"
-    assert start.period == 0.004
+    start = Start(config, config.load_vehicle(), "angle", None)
     with pytest.raises(InputError, match=r"^mode: expected offboard with px4, got angle$"):
-        Start.of(find_stack("px4"), config, "angle")
+        find_stack("px4").make(start)
 
 
 def test_a_task_without_a_goal_is_refused():
