@@ -262,12 +262,13 @@ def test_a_seat_that_nobody_holds_ends_its_program(program, monkeypatch):
     assert not list(folders.iterdir())
 
 
-def test_a_port_in_use_is_named(program):
+def test_a_port_in_use_is_named(program, monkeypatch):
+    monkeypatch.setattr("rotorgram.autopilots.protocol.px4.PORT", 46600)  # others fly by 4560
     with ExitStack() as taken:
-        for port in range(4560, 4576):
+        for port in range(46600, 46616):
             with suppress(OSError):
                 taken.enter_context(socket.create_server(("127.0.0.1", port)))
-        with pytest.raises(InputError, match=r"expected that port 45\d\d is free, got one in use"):
+        with pytest.raises(InputError, match=r"expected that port 466\d\d is free, got one in use"):
             flown(program, "hummingbird")
 
 
