@@ -19,6 +19,10 @@ BOOT: Final = 4.0
 POSE_EVERY: Final = 10
 """Steps between two poses, as motion capture gives them at 100 Hz."""
 ORDER_EVERY: Final = 20
+PATIENCE: Final = 5.0
+"""Time from which the goal of a craft that still stands climbs, s of its clock."""
+_CLIMB: Final = np.array((0.0, 0.0, 0.1))
+"""That climb, m/s: INDI takes thrust from a craft that does not move."""
 _CORNERS: Final = [[1, -1], [-1, -1], [-1, 1], [1, 1]]
 """Signs of x and y of its motors."""
 _FULL: Final = 65535.0
@@ -30,18 +34,15 @@ def parameters(vehicle: Vehicle, propellers: Propellers) -> list[bytes]:
     hover = propellers.hover * _FULL
     curve = vehicle.coefficients["rotors.curve"] or (0.0, 0.0, 1.0)
     _, linear, square = vehicle.thrust_high[0] * np.array(curve)
-    return [
-        protocol.parameter_packet("posCtlPid", "thrustBase", "H", round(hover)),
-        protocol.parameter_packet("ctrlMel", "mass", "f", vehicle.mass),
-        protocol.parameter_packet(
-            "ctrlMel", "massThrust", "f", hover / (vehicle.mass * protocol.G)
-        ),
-        protocol.parameter_packet(
-            "quadSysId", "armLength", "f", math.hypot(*vehicle.rotors[0].position[:2])
-        ),
-        protocol.parameter_packet("quadSysId", "pwmToThrustA", "f", square),
-        protocol.parameter_packet("quadSysId", "pwmToThrustB", "f", linear),
-    ]
+    values = (
+        ("posCtlPid", "thrustBase", "H", round(hover)),
+        ("ctrlMel", "mass", "f", vehicle.mass),
+        ("ctrlMel", "massThrust", "f", hover / (vehicle.mass * protocol.G)),
+        ("quadSysId", "armLength", "f", math.hypot(*vehicle.rotors[0].position[:2])),
+        ("quadSysId", "pwmToThrustA", "f", square),
+        ("quadSysId", "pwmToThrustB", "f", linear),
+    )
+    return [protocol.parameter_packet(*value) for value in values]
 
 
 class Client:
@@ -107,6 +108,8 @@ class Crazyflie(Stack):
         if self._steps % POSE_EVERY == 0:
             self._program.send(protocol.pose_packet(reading))
         if order is not None:
+            if order.stands:
+                order = order._replace(goal=order.goal + _CLIMB * max(reading.time - PATIENCE, 0.0))
             self._program.send(protocol.goal_packet(order))
         elif self.ready and self._parameters:
             self._program.send(self._parameters.pop())

@@ -133,6 +133,16 @@ def test_a_controller_reaches_the_goal(mode: str) -> None:
 
 
 @needs_program
+def test_indi_lifts_a_craft_that_stands_level() -> None:
+    """It takes thrust from a craft that does not move, until its goal is above."""
+    config = hover(4.0, effects={"motor_lag": True}, start_tilt=0.0)
+    (flight,), tally = flown(config, start_of(config, "indi"))
+    errors = np.linalg.norm(flight.pose[:, :3] - (0.0, 0.0, 5.0), axis=1)
+    assert errors[-100:].max() < 0.1
+    assert (tally.late, tally.faults) == (0, [])
+
+
+@needs_program
 def test_datagrams_of_others_change_no_flight() -> None:
     """To the simulator's port, and to the program's."""
     config = hover(0.5)
