@@ -96,7 +96,7 @@ class Program:
         if period is None:
             self._keep_one_core()
         log = self._closing.enter_context((self.folder / _LOG).open("wb"))
-        process = subprocess.Popen(
+        self._process = subprocess.Popen(
             command,
             cwd=self.folder,
             env={**os.environ, **environment},
@@ -105,8 +105,8 @@ class Program:
             stderr=subprocess.STDOUT,
             process_group=0,
         )
-        self._process = process
-        self._closing.callback(_stop, process)
+        self._closing.enter_context(self._process)  # waits for its end
+        self._closing.callback(self._process.kill)  # while it waits it takes no other signal
 
     def _keep_one_core(self) -> None:
         """Keep this thread, and what it starts, on its core until the end, where the system can."""
@@ -237,8 +237,3 @@ def bound_socket(name: str, port: int) -> socket.socket:
             f"{name}: expected that port {port} is free, got one in use: does another run?"
         ) from None
     return bound
-
-
-def _stop(process: subprocess.Popen[bytes]) -> None:
-    process.kill()  # one that waits for its simulator takes no other signal
-    process.wait()

@@ -1,21 +1,16 @@
 """`rotorgram export`: a trained policy as a file, or an app, that flies without rotorgram."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import Annotated, Literal
 
 from tyro.conf import Positional, arg
 
 from ..models.files import check_new_file, write_whole
 from ._flags import ModuleFlag
 
-if TYPE_CHECKING:
-    from ..agents import Checkpoint
-
 
 class Export(ModuleFlag):
-    """Write a trained policy as one file that flies without rotorgram, or as an app of a
-    firmware.
-    """
+    """Write a trained policy as a file, or an app of a firmware, that flies without rotorgram."""
 
     policy: Positional[Annotated[str, arg(metavar="CHECKPOINT")]]
     """Checkpoint, or folder of a training."""
@@ -28,25 +23,20 @@ class Export(ModuleFlag):
     def run(self) -> None:
         """Write it."""
         from ..agents.export import TARGETS, export
+        from ..agents.export.crazyflie import app
+        from ..flights.folders import new_folder
         from ._env import trained
 
         checkpoint = trained(self.policy)
         if self.to == "crazyflie":
-            _write_app(checkpoint, self.out)
+            files = app(checkpoint)
+            folder = new_folder(self.out or Path("crazyflie_policy"), "")
+            for name, text in files.items():
+                write_whole(folder / name, text)
+            print(f"app: {folder} ({len(files)} files)")
             return
         out = self.out or Path(TARGETS[self.to])
         check_new_file(out, out.suffix)
         content = export(checkpoint, self.to)
         write_whole(out, content)
         print(f"policy: {out} ({len(content):,} bytes)")
-
-
-def _write_app(checkpoint: "Checkpoint", out: Path | None) -> None:
-    from ..agents.export.crazyflie import app
-    from ..flights.folders import new_folder
-
-    files = app(checkpoint)
-    folder = new_folder(out or Path("crazyflie_policy"), "")
-    for name, content in files.items():
-        write_whole(folder / name, content)
-    print(f"app: {folder} ({len(files)} files)")

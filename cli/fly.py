@@ -1,7 +1,6 @@
 """`rotorgram fly`: an autopilot, a program of others, in the pilot's seat."""
 
 import time
-from collections import deque
 from collections.abc import Iterator
 from contextlib import AbstractContextManager, closing
 from hashlib import blake2b
@@ -88,7 +87,8 @@ class Fly(EnvFlags, MavlinkFlags):
 
                     show(self, flights())
                 else:
-                    deque(flights(), 0)
+                    for _ in flights():
+                        pass
             taken = time.perf_counter() - began
         self._report(flown, seat.tally, seat.tally.steps / stack.rate / taken)
         if self.film:
@@ -99,6 +99,8 @@ class Fly(EnvFlags, MavlinkFlags):
     def _steered(self) -> "tuple[Fly, Pilot | None]":
         """The command with the env of the policy that moves the sticks, and that policy."""
         if not self.policy:
+            if self.action or self.control_period:
+                raise InputError("--action, --control-period: expected them with --policy alone")
             return self, None
         from ..autopilots.sticks import Pilot
         from ..envs.registry import env_spec
@@ -110,11 +112,13 @@ class Fly(EnvFlags, MavlinkFlags):
         return command, Pilot(policy, env_spec(command.env_config()))
 
     def _program(self) -> Path | None:
-        if self.connect and self.program:
-            raise InputError("--connect: cannot be used with --program")
-        if not self.connect and (self.program is None or not self.program.is_file()):
+        if self.connect:
+            if self.program:
+                raise InputError("--connect: cannot be used with --program")
+            return None
+        if not (self.program and self.program.is_file()):
             raise InputError(f"program: expected --program PATH of a SITL, got {self.program}")
-        return self.program.absolute() if self.program else None
+        return self.program.absolute()
 
     def _opened(self, config: "EnvConfig") -> AbstractContextManager[Any]:
         """The env of the flights, over UDP where they are recorded."""

@@ -40,7 +40,9 @@ def read_events(given: object) -> tuple[Values, ...]:
     if isinstance(given, str):
         given = read_toml(Path(given), "events").get("events")
     if not isinstance(given, list | tuple) or len(given) > MAX_EVENTS:
-        raise InputError(f"events: expected at most {MAX_EVENTS} tables, got {shortened(given)}")
+        raise InputError(
+            f"events: expected at most {MAX_EVENTS} tables [[events]], got {shortened(given)}"
+        )
     return tuple(_read(table, f"events[{number}]") for number, table in enumerate(given))
 
 
@@ -54,10 +56,8 @@ def _read(table: object, where: str) -> Values:
         raise InputError(f"{where}: expected at or when, got both or none")
     for name, row in sizes.items():
         rule = Text(**row["rule"]) if "pattern" in row["rule"] else Limits(**row["rule"])
-        if name in given:
-            event[name] = check(f"{where}.{name}", rule, given[name])
-        elif "default" not in row:
-            raise InputError(f"{where}: expected {name} of a {kind}, got none")
+        if name in given or "default" not in row:
+            event[name] = check(f"{where}.{name}", rule, given.get(name))
     return event
 
 

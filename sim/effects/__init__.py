@@ -50,7 +50,7 @@ class Effects(Kept):
         for name in scaled:
             if name not in ("thrust", *self.rotors.names):
                 count = vehicle.num_rotors
-                raise InputError(f"randomize: expected one of the {count} rotors, got {name}")
+                raise InputError(f"{name}: expected one of the {count} rotors of the vehicle")
         self.on_rotors = self.rotors.acts or bool(scaled)
         self.air = AirEffects(vehicle, options)
         self._is_pushed = not set(PUSH).isdisjoint(drawn)

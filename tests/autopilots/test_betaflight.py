@@ -212,6 +212,14 @@ def test_only_betaflight_has_sticks(capsys: Capsys, tmp_path: Path) -> None:
     assert "policy: expected betaflight, got crazyflie" in refused(capsys, *words)
 
 
+@pytest.mark.parametrize("flag", ["--action=rates", "--control-period=0.02"])
+def test_the_level_of_the_motors_is_not_chosen(capsys: Capsys, tmp_path: Path, flag: str) -> None:
+    program = tmp_path / "program"
+    program.touch()
+    told = refused(capsys, "fly", "betaflight", "--program", program, flag)
+    assert "--action, --control-period: expected them with --policy alone" in told
+
+
 @needs_program
 def test_a_controller_moves_the_sticks(capsys: Capsys) -> None:
     words = ("fly", "betaflight", "--program", PROGRAMS[0], "--vehicle", "hummingbird", "--env",

@@ -351,10 +351,13 @@ def test_a_config_goes_through_json_keywords_and_a_file(tmp_path: Path) -> None:
 
 
 WRONG: list[tuple[str, Any]] = [
-    ("events: expected at most 64 tables, got 3", 3),
+    (r"events: expected at most 64 tables \[\[events\]\], got 3", 3),
     ("expected 'wind' or .* or 'obstacle', got 'storm'", [{"kind": "storm"}]),
     (r"events\[0\]: expected at or when, got both or none", [{"kind": "mass", "mass": 1.0}]),
-    (r"events\[0\]: expected velocity of a wind, got none", [{"kind": "wind", "at": 1.0}]),
+    (
+        r"events\[0\].velocity: expected 3 numbers from -100 to 100 m/s, got None",
+        [{"kind": "wind", "at": 1.0}],
+    ),
     (r"events\[0\]: expected some of .*, got 'mas'", [{"kind": "mass", "at": 1, "mas": 1}]),
     (
         r"events\[0\].mass: expected a number from -1000 to 1000 kg, got inf",
@@ -373,7 +376,7 @@ WRONG: list[tuple[str, Any]] = [
         [{"kind": "mass", "when": "height > 1", "mass": 1.0}],
     ),
     (r"events\[0\].drone: .* 0 to 0, got 1", [{"kind": "mass", "at": 0, "mass": 1, "drone": 1}]),
-    ("expected one of the 4 rotors, got thrust_5", [{"kind": "rotor", "at": 0, "rotor": 5}]),
+    ("thrust_5: expected one of the 4 rotors", [{"kind": "rotor", "at": 0, "rotor": 5}]),
     (
         r"events\[0\]: expected a sensor of the env, got imu, which is off",
         [{"kind": "sensor", "at": 0, "sensor": "imu"}],

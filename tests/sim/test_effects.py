@@ -895,7 +895,7 @@ def test_a_drawn_strength_of_gusts() -> None:
 
 
 def test_a_rotor_that_the_vehicle_lacks_is_refused() -> None:
-    sentence = "randomize: expected one of the 4 rotors, got thrust_5"
+    sentence = "thrust_5: expected one of the 4 rotors of the vehicle"
     refused(sentence, world_of, randomize={"thrust_5": 0.5})
 
 
