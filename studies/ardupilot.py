@@ -155,5 +155,7 @@ def main(program: Path, vehicles: list[str], output: Path) -> None:
 
 
 if __name__ == "__main__":
-    parser = options(__doc__, program=Path, vehicles=list(DRAG), output=RESULTS / "ardupilot.json")
+    parser = options(
+        __doc__, "program", program=Path, vehicles=list(DRAG), output=RESULTS / "ardupilot.json"
+    )
     main(**vars(parser.parse_args()))

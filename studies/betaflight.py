@@ -214,7 +214,9 @@ def repeated(program: Path) -> dict[str, object]:
 
 
 def main() -> None:
-    args = options(__doc__, program=Path, only="", out=RESULTS / "betaflight.json").parse_args()
+    args = options(
+        __doc__, "program", program=Path, only="", out=RESULTS / "betaflight.json"
+    ).parse_args()
     result = json.loads(args.out.read_text()) if args.out.exists() else {}
     program = args.program.absolute()
     with tempfile.TemporaryDirectory() as folder:

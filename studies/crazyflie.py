@@ -111,7 +111,7 @@ def mutated(count: int) -> Mapping[str, int]:
 
 def main() -> None:
     parser = options(
-        __doc__, program=Path, episodes=5, seconds=20.0, out=RESULTS / "crazyflie.json"
+        __doc__, "program", program=Path, episodes=5, seconds=20.0, out=RESULTS / "crazyflie.json"
     )
     args = parser.parse_args()
     program = args.program.absolute()

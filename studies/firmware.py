@@ -127,7 +127,7 @@ def flown(run: Path, app: Path, sitl: Path, episodes: int) -> dict[str, object]:
 
 def main() -> None:
     defaults = {"firmware": Path, "sitl": Path, "out": RESULTS / "firmware.json"}
-    args = options(__doc__, seeds=range(5), episodes=3, **defaults).parse_args()
+    args = options(__doc__, "firmware", "sitl", seeds=range(5), episodes=3, **defaults).parse_args()
     firmware, sitl = args.firmware.resolve(), args.sitl.resolve()
     flights = {}
     with tempfile.TemporaryDirectory() as name:

@@ -21,11 +21,11 @@ Way = TypeVar("Way")
 Value = TypeVar("Value")
 
 
-def options(doc: str, **defaults: object) -> argparse.ArgumentParser:
+def options(doc: str, *needed: str, **defaults: object) -> argparse.ArgumentParser:
     """A parser with an option for each name; `doc` is the script's.
 
     An option takes what its default is, a sequence one value or more. A type stands for an option
-    without a default, and False for a switch.
+    without a default, which may be needed, and False for a switch.
     """
     parser = argparse.ArgumentParser(description=doc.splitlines()[0])
     for name, default in defaults.items():
@@ -33,7 +33,7 @@ def options(doc: str, **defaults: object) -> argparse.ArgumentParser:
         if default is False:
             parser.add_argument(flag, action="store_true")
         elif isinstance(default, type):
-            parser.add_argument(flag, type=default)
+            parser.add_argument(flag, type=default, required=name in needed)
         elif isinstance(default, list | tuple | range):
             parser.add_argument(flag, type=type(default[0]), nargs="+", default=default)
         else:

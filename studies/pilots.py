@@ -50,6 +50,7 @@ NOISY: Mapping[str, object] = {
     "estimate": True,
     "observe": "estimate",
 }
+TASKS = ["Waypoints", "Tracking"]
 CASES: Mapping[str, list[dict[str, object]]] = {
     "calm": [],
     "wind": [{"kind": "wind", "at": AT, "velocity": [WIND, 0.0, 0.0]}],
@@ -239,10 +240,13 @@ def shown(result: Mapping[str, Row], vehicle: str, tasks: list[str]) -> None:
 def main() -> None:
     parser = options(
         __doc__, betaflight=Path, crazyflie=Path, ardupilot=Path, vehicle="crazyflie2", seeds=5,
-        tasks=["Waypoints", "Tracking"], cases=list(CASES), only=["all"], film=Path,
+        tasks=TASKS, cases=list(CASES), only=["all"], film=Path,
         out=RESULTS / "pilots.json",
     )  # fmt: skip
     args = parser.parse_args()
+    unknown = {*args.tasks, *args.cases}.difference(TASKS, CASES)
+    if unknown:
+        parser.error(f"expected tasks of {TASKS} and cases of {list(CASES)}, got {sorted(unknown)}")
     vehicle = Vehicle.load(args.vehicle)
     programs = {name: getattr(args, name) for name in ("betaflight", "crazyflie", "ardupilot")}
     kept: dict[str, Row] = {}
