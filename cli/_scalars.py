@@ -3,15 +3,19 @@
 import math
 import time
 from pathlib import Path
-from typing import Any
-
-from tensorboard.compat.proto.event_pb2 import Event, SessionLog
-from tensorboard.compat.proto.summary_pb2 import Summary
-from tensorboard.summary.writer.record_writer import RecordWriter
+from struct import pack
 
 _POINTS = 200  # of each curve: the width of a chart, and less than 1 MB for all
 _LEAST = 100  # env steps between two points: in short runs more would cost time
 _PREFIX = "events.out.tfevents."
+_START = b"\x3a\x02\x08\x01"  # a SessionLog with the status START
+
+
+_CRC = []  # CRC-32C of each byte
+for _crc in range(256):
+    for _ in range(8):
+        _crc = _crc >> 1 ^ (0x82F63B78 if _crc & 1 else 0)
+    _CRC.append(_crc)
 
 
 class ScalarWriter:
@@ -31,13 +35,13 @@ class ScalarWriter:
         # files in the order of their names. After the clock went back it would skip the new one.
         number = len(list(folder.glob(f"{_PREFIX}*")))
         name = f"{_PREFIX}{number:010}.rotorgram"
-        self._file = RecordWriter(open(folder / name, "xb"))  # noqa: SIM115  until `close`
+        self._file = open(folder / name, "xb")  # noqa: SIM115  until `close`
         self.flush = self._file.flush
         self.close = self._file.close
-        self._add(file_version="brain.Event:2")
+        self._add(0, _field(3, b"brain.Event:2"))
         # TensorBoard drops what it has read from this step on. One of its two readers skips the
         # first such mark of a folder: so a fresh training has one too.
-        self._add(step=behind + 1, session_log=SessionLog(status=SessionLog.START))
+        self._add(behind + 1, _START)
 
     def due(self, env_steps: int, *, last: bool = False) -> bool:
         """Asked at every update: whether to write at it; at the last, if it is not written yet."""
@@ -47,10 +51,39 @@ class ScalarWriter:
 
     def write(self, env_steps: int, numbers: dict[str, float]) -> None:
         """Write finite numbers as one event: a sixth of what so many `add_scalar` take."""
-        values = [Summary.Value(tag=tag, simple_value=number) for tag, number in numbers.items()]
-        self._add(step=env_steps, summary=Summary(value=values))
+        values = [
+            _field(1, _field(1, tag.encode()) + b"\x15" + pack("<f", value))
+            for tag, value in numbers.items()
+        ]
+        self._add(env_steps, _field(5, b"".join(values)))
         self._written = env_steps
 
-    def _add(self, **content: Any) -> None:
-        event = Event(wall_time=time.time(), **content)
-        self._file.write(event.SerializeToString())
+    def _add(self, step: int, content: bytes) -> None:
+        """Append an Event of TensorFlow's `event.proto`: time, step, and a field with the rest."""
+        data = b"\x09" + pack("<d", time.time()) + b"\x10" + _varint(step) + content
+        size = pack("<Q", len(data))
+        self._file.write(size + _checksum(size) + data + _checksum(data))
+
+
+def _field(number: int, content: bytes) -> bytes:
+    """A field of a Protocol Buffers message: bytes, a text or a message."""
+    return bytes((8 * number + 2,)) + _varint(len(content)) + content
+
+
+def _varint(number: int) -> bytes:
+    """Seven bits in each byte, the lowest first; the highest bit says that another follows."""
+    parts = bytearray()
+    while number > 127:
+        parts.append(number & 127 | 128)
+        number >>= 7
+    return bytes((*parts, number))
+
+
+def _checksum(data: bytes) -> bytes:
+    """CRC-32C, masked as TensorFlow's records have it: its own writer takes 0.1 s to import."""
+    crc = 0xFFFFFFFF
+    for byte in data:
+        crc = crc >> 8 ^ _CRC[(crc ^ byte) & 0xFF]
+    crc ^= 0xFFFFFFFF
+    turned = crc >> 15 | crc << 17
+    return pack("<I", turned + 0xA282EAD8 & 0xFFFFFFFF)

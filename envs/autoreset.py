@@ -219,5 +219,8 @@ def checked_seeds(seed: Any, num_envs: int, most: int | None = None) -> Seeds | 
     except (TypeError, ValueError, OverflowError):
         seeds = []
     if len(seeds) != num_envs:
-        raise InputError(f"seed: expected {rule.expected}, or {num_envs} of them, got {seed!r}")
+        expected = rule.expected
+        if most is not None:
+            expected = f"a whole number from 0 to 2^{most.bit_length()} - 1"
+        raise InputError(f"seed: expected {expected}, or {num_envs} of them, got {seed!r}")
     return seeds

@@ -162,7 +162,8 @@ class RemoteEnv(_Remote, gym.Env[Observation, ArrayLike]):
 
     def step(self, action: ArrayLike) -> tuple[Observation, float, bool, bool, Info]:
         """Fly for one control period. The action is sent in the dtype of its space."""
-        self._expect_flight()
+        if not self._flying:
+            raise gym.error.ResetNeeded("step: expected a call of reset() first")
         usual = self._nothing
         actions = np.asarray(action)[np.newaxis]
         if actions.dtype != usual.dtype or actions.shape != usual.shape:
@@ -199,8 +200,10 @@ class RemoteEnv(_Remote, gym.Env[Observation, ArrayLike]):
 
     def _observation(self) -> Observation:
         """As the space has it, a copy."""
-        arrays = zip(self._arrays, self._state.observations, strict=True)
-        return joined(self.env_spec, {name: np.array(array[0]) for name, array in arrays})
+        arrays = self._state.observations
+        if len(arrays) == 1:
+            return np.array(arrays[0][0])
+        return {name: np.array(a[0]) for name, a in zip(self._arrays, arrays, strict=True)}
 
     def _info(self) -> Info:
         numbers: list[float] = []

@@ -89,7 +89,7 @@ def test_training_by_the_command_takes_the_preset_s_drones_and_loads_nothing_slo
     words = ["train", "ppo", "--env-steps", "2100", "--out", str(folder)]
     slow = {
         "matplotlib", "pandas", "rich", "rotorgram.udp", "scipy", "stable_baselines3",
-        "torch", "typeguard",
+        "tensorboard", "torch", "typeguard",
     }  # fmt: skip
     code = f"import sys; from rotorgram.cli import main; assert main({words}) == 0; " + (
         f"print(sorted({slow} & set(sys.modules)))"

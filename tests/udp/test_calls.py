@@ -15,7 +15,7 @@ from rotorgram.udp import RemoteEnv, protocol
 
 UDP = str(Path(protocol.__file__).parents[1])
 STEPS = 41
-MOST = 52
+MOST = 40
 
 
 def test_a_step_of_one_drone_takes_few_calls() -> None:

@@ -172,7 +172,7 @@ def test_wrong_seeds(seed: Any) -> None:
         seeds = [0, 2**64 - 1, 5, 5]
         assert_same(remote.reset(seed=seeds), local.reset(seed=seeds))
         sent = remote.statistics.counters["sent"]
-        sentence = f"seed: expected a whole number from 0 to {2**64 - 1}, or 4 of them, got"
+        sentence = r"seed: expected a whole number from 0 to 2\^64 - 1, or 4 of them, got"
         with pytest.raises(ValueError, match=sentence):
             remote.reset(seed=seed)
         if np.ndim(seed):

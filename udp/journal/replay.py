@@ -14,7 +14,6 @@ from ...models import Backend
 from ...models.errors import InputError, printable, shortened
 from ..protocol.layout import Array
 from ..protocol.messages import Command, State
-from ..protocol.party import follow
 from ..transport.simulator import COMMAND_AGE
 from ..transport.stepped import Steppable, make_stepped
 from .reader import Item, Recording, Session, count_of
@@ -103,7 +102,8 @@ class SessionVerdict:
         if command is None:
             number = state.sequence - 1
             raise InputError(f"expected Command {number} before it, got none of that number")
-        follow(self._loop, command)
+        resets = command.resets
+        self._loop.advance(command.actions, resets, command.seeds, command.frozen, command.asks)
         return self._loop
 
     def _make(self) -> Steppable:

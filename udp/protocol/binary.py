@@ -217,7 +217,12 @@ def encode_step(m: Step, layout: Layout) -> bytes:
         pieces += (slot.pad, array.tobytes())
     rest = b"".join(pieces)
     data = _START[kind] + zlib.crc32(rest, _START_CRC[kind]).to_bytes(4, "little") + rest
-    _check_step(data, time, record, layout)
+    if wrong := data[record.flags].translate(None, record.legal):
+        raise _wrong_flags(wrong, record)
+    # NaN and infinity stay in a sum. Huge numbers may overflow, so a second look decides.
+    numbers = record.numbers
+    if numbers is None or not isfinite(sum(numbers.unpack_from(data, record.slots[0].at), time)):
+        _check_numbers(data, time, record, layout)
     return data
 
 
@@ -234,7 +239,11 @@ def _decode_step(kind: int, data: bytes, session: int, sequence: int, layout: La
         record = layout.commands[has_seeds, has_asks]
     if len(data) != record.size:
         raise InputError(f"expected {record.size} bytes, got {len(data)}")
-    _check_step(data, time, record, layout)
+    if wrong := data[record.flags].translate(None, record.legal):
+        raise _wrong_flags(wrong, record)
+    numbers = record.numbers
+    if numbers is None or not isfinite(sum(numbers.unpack_from(data, record.slots[0].at), time)):
+        _check_numbers(data, time, record, layout)
     arrays = []
     for slot in record.slots:
         arrays.append(np.ndarray(slot.shape, slot.dtype, data, slot.at))
@@ -262,23 +271,10 @@ def _decode_step(kind: int, data: bytes, session: int, sequence: int, layout: La
     )
 
 
-def _check_step(data: bytes, time: float, record: Record, layout: Layout) -> None:
-    """Raises `InputError` for numbers, flags or requests that cannot be."""
-    numbers = record.numbers
-    # NaN and infinity stay in a sum. Huge numbers may overflow, so a second look decides.
-    if numbers is None or not isfinite(sum(numbers.unpack_from(data, record.slots[0].at), time)):
-        _check_numbers(data, time, record, layout)
-    if wrong := data[record.flags].translate(None, record.legal):
-        raise InputError(f"flags: expected 0 to {record.legal[-1]}, got {wrong[0]}")
-    if record.asks is not None:
-        offered = layout.asked_bits
-        unknown = record.asks.view(data) & ~np.uint64(offered)
-        if unknown.any():
-            raise InputError(f"requests: expected bits of {offered:#x}, got {unknown.max():#x}")
-
-
 def _check_numbers(data: bytes, time: float, record: Record, layout: Layout) -> None:
-    """Raises `InputError` for numbers that are not finite, or a choice that does not exist."""
+    """Raises `InputError` for numbers that are not finite, or a choice or a request that does not
+    exist.
+    """
     if not isfinite(time):
         raise InputError(f"time: expected a finite number, got {time}")
     for slot in record.slots:
@@ -296,6 +292,15 @@ def _check_numbers(data: bytes, time: float, record: Record, layout: Layout) -> 
         if beyond.any():
             most = layout.choices - 1
             raise InputError(f"action: expected a choice 0 to {most}, got {actions[beyond][0]}")
+    if record.asks is not None:
+        offered = layout.asked_bits
+        unknown = record.asks.view(data) & ~np.uint64(offered)
+        if unknown.any():
+            raise InputError(f"requests: expected bits of {offered:#x}, got {unknown.max():#x}")
+
+
+def _wrong_flags(wrong: bytes, record: Record) -> InputError:
+    return InputError(f"flags: expected 0 to {record.legal[-1]}, got {wrong[0]}")
 
 
 # ---- the bodies of all others

@@ -476,7 +476,10 @@ class Client:
         """Send a message and repeat it until it is answered."""
         kind = type(message)
         after = SIMULATOR[self.state]["sent", kind]
-        data = self._encode(message)
+        if isinstance(message, State) and not self.by_text:
+            data = binary.encode_step(message, self.layout)
+        else:
+            data = self._encode(message)
         if self.tap:
             self._record(message, data)
         self._transfer = transfer = Transfer(data, self.largest)

@@ -62,7 +62,8 @@ class Record(NamedTuple):
     flags: slice  # bytes that are flags or orders
     legal: bytes  # values of these bytes
     numbers: struct.Struct | None
-    """Reads the floats from the first array on, for a quick check; None if NumPy is faster."""
+    """Reads the floats from the first array on, for a quick check; None if NumPy is faster, or
+    other numbers are to be checked too."""
     asks: Slot | None = None
     """Requests of a Command that has them."""
 
@@ -116,8 +117,8 @@ class Layout:
             slots = _slots(COMMAND_ARRAYS_AT, drones, arrays)
             self.actions, orders, *_ = slots
             flags = slice(orders.at, orders.end)
-            floats = _numbers(slots[:1]) if self.action else None
             asks = slots[-1] if has[1] else None
+            floats = _numbers(slots[:1]) if self.action and not asks else None
             self.commands[has] = Record(slots, slots[-1].end, flags, b"\0\1\2", floats, asks)
         size = max(self.state.size, self.commands[True, True].size)
         if size > MAX_MESSAGE:

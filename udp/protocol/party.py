@@ -49,14 +49,6 @@ class World(Protocol):
     ) -> None: ...
 
 
-def follow(world: World, command: Command) -> None:
-    """Move the drones by a Command."""
-    if command.orders.tobytes() == bytes(len(command.orders)):  # all fly
-        world.advance(command.actions, None, None, None, command.asks)
-    else:
-        world.advance(command.actions, command.resets, command.seeds, command.frozen, command.asks)
-
-
 Participation = Literal["coming", "ready", "flying", "waiting", "left"]
 """What an agent does in the running episode.
 
@@ -151,7 +143,10 @@ class WorldRules:
 
     def next_timer(self) -> float:
         """When `handle_timers` wants to be called; infinite if never."""
-        return min([link.client.next_timer() for link in self.links])
+        timer = inf
+        for link in self.links:
+            timer = min(timer, link.client.resend_at, link.client.deadline)
+        return timer
 
     def handle_timers(self, now: float) -> None:
         """Resend what is due. Raises `PeerSilent` where the flight cannot go on."""
@@ -198,11 +193,6 @@ class WorldRules:
                 now,
             )
 
-    def _move(self, cause: Command) -> None:
-        """Move the world."""
-        follow(self.world, cause)
-        self.cause = cause
-
     def _lose_silent(self, link: AgentLink, why: str) -> None:
         raise NotImplementedError
 
@@ -235,6 +225,7 @@ class OneAgent(WorldRules):
         (self._link,) = self.links
         self._client = self._link.client
         self._to_follow: Command | None = None
+        self._all_fly = bytes(self.layout.drones)  # orders
 
     def start(self, now: float) -> None:
         """Say Hello. An agent that flies text sends no Welcome: begin without."""
@@ -266,7 +257,12 @@ class OneAgent(WorldRules):
         command = self._to_follow
         if command is None:
             return False
-        self._move(command)
+        if command.orders.tobytes() == self._all_fly:
+            self.world.advance(command.actions, None, None, None, command.asks)
+        else:
+            resets = command.resets
+            self.world.advance(command.actions, resets, command.seeds, command.frozen, command.asks)
+        self.cause = command
         self._to_follow = None
         self._due.append(self._link)
         return False
@@ -334,7 +330,8 @@ class SeveralAgents(WorldRules):
     def _begin(self) -> None:
         """Begin an episode for all that take part."""
         joining = self._who("flying", "waiting", "ready")
-        self._move(reset_of_all(self.layout, self._seeds(joining)))
+        self.cause = reset = reset_of_all(self.layout, self._seeds(joining))
+        self.world.advance(reset.actions, reset.resets, reset.seeds, None)
         if self.steps or not self.episodes:
             self.episodes += 1
         self.steps = 0
@@ -367,9 +364,10 @@ class SeveralAgents(WorldRules):
                     asks[link.rows] = link.command.asks
         self.steps += 1
         orders = np.full(self.layout.drones, FLY, np.uint8)
-        self._move(
-            Command(session=0, sequence=self.steps, actions=actions, orders=orders, asks=asks)
+        self.cause = Command(
+            session=0, sequence=self.steps, actions=actions, orders=orders, asks=asks
         )
+        self.world.advance(actions, None, None, None, asks)
         for link in staying:
             self._queue(link)
 

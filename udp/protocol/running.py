@@ -100,14 +100,17 @@ class FreeRunning(OneAgent):
 
     def _hold(self) -> None:
         """Step without a Command."""
+        world = self.world
         self._held += 1
         self.unasked += 1
         self.counters["held"] += 1
+        done = world.done
         actions = self._actions
         if self.failsafe is not None and self._held * self.period > self.run.silence:
             actions = self.failsafe().astype(actions.dtype)
-        orders = self.world.done * np.uint8(FREEZE)
-        self._move(Command(session=0, sequence=0, actions=actions, orders=orders))
+        orders = done * np.uint8(FREEZE)
+        self.cause = Command(session=0, sequence=0, actions=actions, orders=orders)
+        world.advance(actions, None, None, done)
         self._sum(True)
 
     def _sum(self, goes_on: Array | bool) -> None:
