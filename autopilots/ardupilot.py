@@ -43,13 +43,15 @@ _OPTIONS: Final = (
     "--speedup=1000",
     "--start-time=1700000000",  # GPS tells it the time
 )
-_MODE, _ARM, _TAKE_OFF, _SEND_EVERY = 176, 400, 22, 511  # MAV_CMD
-_START_MISSION, _WAYPOINT = 300, 16
-_ABOVE_HOME: Final = 3
-_GUIDED, _FORCED = 4, 21196
-_REPORT: Final = 193  # EKF_STATUS_REPORT
-_READY: Final = 1 | 2 | 4 | 8 | 16  # attitude, velocities, position
-_POSITION_AND_YAW: Final = 0b100111111000
+_FORCED: Final = 21196  # to arm without checks
+_READY: Final = (
+    mavlink.EKF_ATTITUDE
+    | mavlink.EKF_VELOCITY_HORIZ
+    | mavlink.EKF_VELOCITY_VERT
+    | mavlink.EKF_POS_HORIZ_REL
+    | mavlink.EKF_POS_HORIZ_ABS
+)
+_POSITION_AND_YAW: Final = 0b100111111000  # what a setpoint leaves out has its bit set
 
 
 def motor_order(vehicle: Vehicle) -> tuple[int, int, list[int]]:
@@ -123,9 +125,9 @@ class ArduPilot(Stack):
             wind = np.array(config.effects.wind)
             self._optional["velocity_wind"] = north_east_down(wind)
         self._commands = [
-            (_MODE, 1, _GUIDED),
-            (_ARM, 1, _FORCED),
-            (_TAKE_OFF, 0, 0, 0, 0, 0, 0, 1),
+            (mavlink.MAV_CMD_DO_SET_MODE, 1, mavlink.COPTER_MODE_GUIDED),
+            (mavlink.MAV_CMD_COMPONENT_ARM_DISARM, 1, _FORCED),
+            (mavlink.MAV_CMD_NAV_TAKEOFF, 0, 0, 0, 0, 0, 0, 1),
         ]
         program = Program("ardupilot", 0)
         super().__init__(program, len(self._order))
@@ -188,12 +190,13 @@ class ArduPilot(Stack):
                 case "MISSION_REQUEST":
                     self._send_item(message.seq)
                 case "MISSION_ACK" if message.type == 0:
-                    self._commands = [(_START_MISSION,)]
+                    self._commands = [(mavlink.MAV_CMD_MISSION_START,)]
 
     def _talk_of(self, order: Order | None, origin: Floats) -> None:
         """One message: a command until it is accepted, then the goal."""
         if not self.ready and self._steps % ASK_EVERY == 0:
-            self._command(_SEND_EVERY, _REPORT, 100_000)
+            report = mavlink.MAVLINK_MSG_ID_EKF_STATUS_REPORT
+            self._command(mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, report, 100_000)
         elif order is not None and self._commands:
             self._command(*self._commands[0])
         elif order is None or order.stands:
@@ -206,7 +209,8 @@ class ArduPilot(Stack):
             goal = north_east_down(order.goal - origin)
             yaw = math.pi / 2 - order.heading
             moves = [0.0] * 6
-            fields = (0, 1, 1, 1, _POSITION_AND_YAW, *goal, *moves, yaw, 0)
+            frame = mavlink.MAV_FRAME_LOCAL_NED
+            fields = (0, 1, 1, frame, _POSITION_AND_YAW, *goal, *moves, yaw, 0)
             self._mav.set_position_target_local_ned_send(*fields)
 
     def _send_item(self, number: int) -> None:
@@ -214,8 +218,10 @@ class ArduPilot(Stack):
         assert self._origin is not None
         latitude, longitude, _ = geodetic(self._goal, _EARTH)
         height = self._goal[2] - self._origin[2]
-        fields = (_ABOVE_HOME, _WAYPOINT, 0, 1, 1, 0, 0, 0, latitude, longitude, height)
-        self._mav.mission_item_int_send(1, 1, number, *fields)
+        frame = mavlink.MAV_FRAME_GLOBAL_RELATIVE_ALT
+        place = latitude, longitude, height
+        to = mavlink.MAV_CMD_NAV_WAYPOINT
+        self._mav.mission_item_int_send(1, 1, number, frame, to, 0, 1, 1, 0, 0, 0, *place)
 
     def _command(self, number: int, *values: int) -> None:
         filled = (*values, *[0] * 7)[:7]

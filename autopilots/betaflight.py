@@ -206,8 +206,10 @@ class Betaflight(Stack):
         program, environment = new_program(not real_time)
         super().__init__(program, rotors)
         (program.folder / _MEMORY).write_bytes(memory)
-        environment["BETAFLIGHT_LOCKSTEP"] = "1"
-        own_period = config.control_period if real_time else None
+        own_period = config.control_period
+        if not real_time:
+            own_period = None
+            environment["BETAFLIGHT_LOCKSTEP"] = "1"
         program.start(path, environment=environment, period=own_period)
         program.meet(self._read)
 

@@ -109,7 +109,7 @@ class Program:
         self._closing.callback(self._process.kill)  # while it waits it takes no other signal
 
     def _keep_one_core(self) -> None:
-        """Keep this thread, and what it starts, on its core until the end, where the system can."""
+        """Keep this thread, and what it starts, on one core until the end, where the system can."""
         thread = threading.get_native_id()  # another one may end this
         with suppress(OSError, AttributeError):
             cores = os.sched_getaffinity(thread)

@@ -50,6 +50,11 @@ class Stack(ABC):
         self._steps = 0
         self._throttles: Floats = np.zeros(rotors)
 
+    @property
+    def takes_order(self) -> bool:
+        """Whether one is due with the next step."""
+        return self._steps % self.order_every == 0
+
     def step(self, reading: Reading, order: Order | None, observation: Observation) -> Floats:
         """Throttle of each rotor, 0 to 1, shape (R,), after one period of the program's clock.
 
@@ -151,7 +156,6 @@ class Seat:
         """End the program: the next observation begins an episode, and a new one."""
         self.close()
         self._time = 0.0
-        self._steps = 0  # of the program
         self._counts = not self._arguments[1].real_time  # it boots by its own clock
         self._failed = False
 
@@ -178,7 +182,7 @@ class Seat:
         if stack is not None:
             reading = self._instruments.reading(seen, self._time)
             order = None
-            if self._takes_order(stack):
+            if stack.takes_order:
                 order = self._instruments.order(seen, reading)
                 seen = self._instruments.seen(seen, reading, order)
             try:
@@ -198,7 +202,7 @@ class Seat:
         while lift < LIFTED * weight:
             reading = stands._replace(time=self._time)
             order = None
-            if stack.ready and self._takes_order(stack):
+            if stack.ready and stack.takes_order:
                 order = Order(reading.position, heading_of(reading.quaternion), stands=True)
             lift = self._propellers.lift(self._step(stack, reading, order, observation))
             if self._time > LONGEST_STAND:
@@ -208,10 +212,6 @@ class Seat:
                 )
         self.lifted_after = self._time
         self._counts = True
-
-    def _takes_order(self, stack: Stack) -> bool:
-        """Whether one is due."""
-        return self._steps % stack.order_every == 0
 
     def _step(
         self, stack: Stack, reading: Reading, order: Order | None, observation: Any
@@ -225,7 +225,6 @@ class Seat:
         if not all(0.0 <= one <= 1.0 for one in got):  # nan is not
             raise InputError(f"autopilot: expected throttles from 0 to 1, got {got}")
         self._time += self._period
-        self._steps += 1
         return throttle
 
 

@@ -57,8 +57,10 @@ class _Handler(BaseHTTPRequestHandler):
         self._reply(self._steered, "application/json")
 
     def _steered(self) -> bytes:
-        length = self.headers.get("Content-Length", "")
-        size = check("body", _LONGEST, int(length[:9]) if length.isdecimal() else length)
+        length: str | int = self.headers.get("Content-Length", "")
+        with suppress(ValueError):  # of what is no number, or has thousands of digits
+            length = int(length)
+        size = check("body", _LONGEST, length)
         self.server.steer(self.rfile.read(size))
         return self.server.shown
 

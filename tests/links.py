@@ -24,6 +24,7 @@ from rotorgram.udp.protocol.messages import (
     Wait,
     Welcome,
 )
+from rotorgram.udp.protocol.party import WorldRules
 from rotorgram.udp.protocol.server import Server
 from rotorgram.udp.protocol.session import Event
 
@@ -98,6 +99,26 @@ def agent(
     key = Key(SECRET, "agent") if sealed else None
     rest = {"draw_nonce": lambda: NONCE, "text_layout": lambda: ONE, **rest}
     return Server(lambda _: refusal or of, slots=slots, key=key, **rest)
+
+
+class BothSides:
+    """A world and its agents, on a clock that the test moves."""
+
+    now: float
+    rules: WorldRules
+
+    def pump(self) -> None:
+        """Carry datagrams until nothing moves."""
+        raise NotImplementedError
+
+    def wait(self, seconds: float) -> None:
+        """Let time pass, with every timer at its time."""
+        until = self.now + seconds
+        while self.rules.next_timer() <= until:
+            self.now = max(self.now, self.rules.next_timer())
+            self.rules.handle_timers(self.now)
+            self.pump()
+        self.now = until
 
 
 def outgoing(side: Client | Server) -> Any:

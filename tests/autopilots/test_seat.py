@@ -31,7 +31,7 @@ class Hovering:
     ready: bool = False
     why: str = "it boots"
     late: int = 0
-    order_every: int = 1
+    takes_order: bool = True
     seen: list = field(default_factory=list)
     told: list = field(default_factory=list)
     closed: int = 0

@@ -10,7 +10,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from commands import Capsys, refused
-from links import HERE, NONCE, hello, layout, outgoing
+from links import HERE, NONCE, BothSides, hello, layout, outgoing
 from peers import ANY, Running, simulate
 from rotorgram.envs.compiled import make_loop
 from rotorgram.envs.config import EnvConfig
@@ -53,7 +53,7 @@ class World:
         self.done = self.out = (self.done & ~begun) | self.terminated
 
 
-class Flight:
+class Flight(BothSides):
     """Both sides, on a clock that the test moves."""
 
     def __init__(self, failsafe: bool = True) -> None:
@@ -93,15 +93,6 @@ class Flight:
         sent = np.array(actions, np.float32).reshape(2, 1)
         session.send_command(sent, np.array(orders, np.uint8), None, self.now)
         self.pump()
-
-    def wait(self, seconds: float) -> None:
-        """Let time pass, with every timer at its time."""
-        until = self.now + seconds
-        while self.rules.next_timer() <= until:
-            self.now = max(self.now, self.rules.next_timer())
-            self.rules.handle_timers(self.now)
-            self.pump()
-        self.now = until
 
     @property
     def counts(self) -> tuple[int, int, int]:

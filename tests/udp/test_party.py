@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from links import HERE, NONCE, hello, layout, outgoing
+from links import HERE, NONCE, BothSides, hello, layout, outgoing
 from rotorgram.udp.protocol import binary
 from rotorgram.udp.protocol.client import Client, LinkConfig
 from rotorgram.udp.protocol.errors import LinkError, PeerSilent, Refused
@@ -47,7 +47,7 @@ class World:
         self.height = self.height + actions
 
 
-class Swarm:
+class Swarm(BothSides):
     """Both sides of a world of two drones, each flown by an agent of its own."""
 
     def __init__(self, shares: tuple[list[int], ...] = ([0], [1])) -> None:
@@ -97,15 +97,6 @@ class Swarm:
         (session,) = self.agents[number].slots
         assert session is not None
         session.send_command(actions, orders, seeds, self.now)
-
-    def wait(self, seconds: float) -> None:
-        """Let time pass, with every timer at its time."""
-        until = self.now + seconds
-        while self.rules.next_timer() <= until:
-            self.now = max(self.now, self.rules.next_timer())
-            self.rules.handle_timers(self.now)
-            self.pump()
-        self.now = until
 
     def never_answered(self) -> None:
         """Let time pass in which every datagram is lost."""
