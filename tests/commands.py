@@ -20,6 +20,14 @@ started: list[Process] = []
 """What `start` has started."""
 
 
+def write_program(path: Path, text: str) -> None:
+    """A program of Python's, which runs in folders with spaces in their names too."""
+    script = path.with_suffix(".py")
+    script.write_text(text)
+    path.write_text(f'#!/bin/sh\nexec "{sys.executable}" "{script}" "$@"\n')
+    path.chmod(0o755)
+
+
 def run(capsys: Capsys, *arguments: object) -> tuple[int, str, str]:
     """Exit status, standard output and standard error of a command."""
     try:

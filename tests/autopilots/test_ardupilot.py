@@ -2,7 +2,6 @@
 
 import math
 import os
-import sys
 from collections.abc import Iterator
 from contextlib import closing
 from hashlib import blake2b
@@ -10,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from commands import write_program
 from rotorgram.autopilots.ardupilot import ArduPilot, motor_order, tuning
 from rotorgram.autopilots.reading import Order, Propellers, Reading
 from rotorgram.autopilots.seat import Seat, Start, seated
@@ -92,10 +92,7 @@ def start_of(program: Path, mode: str = "guided") -> Start:
 def written(folder: Path, behaviour: str) -> Path:
     """A program that does this for each state."""
     program = folder / "peer"
-    script = folder / "peer.py"
-    script.write_text(PEER.format(behaviour=behaviour))
-    program.write_text(f'#!/bin/sh\nexec "{sys.executable}" "{script}" "$@"\n')
-    program.chmod(0o755)
+    write_program(program, PEER.format(behaviour=behaviour))
     return program
 
 

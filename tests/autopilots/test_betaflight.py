@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from commands import Capsys, output, refused
+from commands import Capsys, output, refused, write_program
 from numpy.typing import NDArray
 from rotorgram.agents.policies import Observation
 from rotorgram.autopilots import find_stack
@@ -150,8 +150,7 @@ def test_a_cli_that_never_ends_its_answer_is_given_up(
 ) -> None:
     monkeypatch.setattr("rotorgram.autopilots.betaflight.ANSWER", 1.0)
     program = tmp_path / "talks"
-    program.write_text(f"#!{sys.executable}\n{TALKS}")
-    program.chmod(0o755)
+    write_program(program, TALKS)
     config = config_of()
     start = Start(seated(config, STACK.rate), config.load_vehicle(), "angle", program)
     sentence = r"^betaflight: expected its CLI, got none: no end of its answer to '#'$"

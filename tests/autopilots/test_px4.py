@@ -2,7 +2,6 @@
 
 import math
 import socket
-import sys
 import tempfile
 from contextlib import ExitStack, closing, suppress
 from itertools import pairwise
@@ -10,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from commands import write_program
 from rotorgram.envs.config import EnvConfig
 from rotorgram.envs.vector import LocalVectorEnv
 from rotorgram.flights.trajectories import fly_episodes
@@ -134,8 +134,7 @@ def program(tmp_path):
     """The stand-in where a build of PX4 has its program."""
     file = tmp_path / "px4_sitl_default" / "bin" / "px4"
     file.parent.mkdir(parents=True)
-    file.write_text(f'#!/bin/sh\nexec "{sys.executable}" "{PEER}" "$@"\n')
-    file.chmod(0o755)
+    write_program(file, PEER.read_text())
     return file
 
 
@@ -236,7 +235,7 @@ def test_one_that_ends_before_it_connects_says_what_it_said(program, monkeypatch
 
 def test_outputs_of_another_time_are_late(program):
     text = WRONG_TIME.format(talks=False, time=2**62, throttle=0.6)
-    program.write_text(f"#!{sys.executable}\n{text}")
+    write_program(program, text)
     _, tally = flown(program, "hummingbird", episode_length=10)
     assert tally.faults == []
     assert tally.late == tally.steps
@@ -244,7 +243,7 @@ def test_outputs_of_another_time_are_late(program):
 
 def test_one_that_repeats_old_outputs_is_named(program, monkeypatch):
     monkeypatch.setattr("rotorgram.autopilots.programs.ANSWER", 0.5)
-    program.write_text(f"#!{sys.executable}\n{WRONG_TIME.format(talks=True, time=5, throttle=0)}")
+    write_program(program, WRONG_TIME.format(talks=True, time=5, throttle=0))
     sentence = r"^px4: expected an answer within 5 s, got none$"
     with pytest.raises(PeerSilent, match=sentence):
         flown(program, "hummingbird")
