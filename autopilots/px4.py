@@ -22,6 +22,8 @@ BOOT: Final = 5.0
 """Time until it gets orders, s of its clock: its estimate has to settle first."""
 CONNECT: Final = 30.0
 """Longest time until it connects, s."""
+UNHEARD: Final = 1.0 / protocol.RATE
+"""Time that a step waits for outputs before there were any, s."""
 _ABOVE: Final = np.array((0.0, 0.0, 2.0))  # m: it lifts off for a goal above it alone
 GPS_EVERY: Final = 25
 """Steps between two fixes."""
@@ -140,7 +142,7 @@ class Px4(Stack):
         too early for their step.
         """
         while self._time < self._sent:
-            wait = ANSWER if self._time else 1.0 / protocol.RATE
+            wait = ANSWER if self._time else UNHEARD
             try:
                 received = self._program.receive(self._peer, wait)
             except PeerSilent:

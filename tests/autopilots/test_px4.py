@@ -233,7 +233,8 @@ def test_one_that_ends_before_it_connects_says_what_it_said(program, monkeypatch
         flown(program, "hummingbird")
 
 
-def test_outputs_of_another_time_are_late(program):
+def test_outputs_of_another_time_are_late(program, monkeypatch):
+    monkeypatch.setattr(px4, "UNHEARD", 5.0)  # the first step, too, gets its outputs
     text = WRONG_TIME.format(talks=False, time=2**62, throttle=0.6)
     write_program(program, text)
     _, tally = flown(program, "hummingbird", episode_length=10)
