@@ -32,6 +32,11 @@ FULL_ANGLE: Final = 60.0
 APART: Final = 10
 """Between the ports of two programs."""
 MOST_MOTORS: Final = 8
+AT_ONCE: Final = 8
+"""Commands that its CLI is given together: they and the answers fit into its buffers."""
+FOREVER: Final = 10**6
+"""Longer than a program is configured, s of its clock."""
+_PROMPT: Final = "# "
 _LOWEST: Final = 1050.0  # µs: throttle 0
 _ARM, _ANGLE = 4, 5  # channels
 _AXES = ("roll", "pitch", "yaw")
@@ -102,14 +107,16 @@ class Firmware(NamedTuple):
     memory: bytes
 
 
-def new_program(lockstep: bool) -> tuple[Program, dict[str, str]]:
-    """A program that may run, in lock-step with ports of its own, and its environment."""
+def new_program(lockstep: bool, alone: int = 2) -> tuple[Program, dict[str, str]]:
+    """A program that may run, and its environment. In lock-step it has ports of its own, and its
+    clock runs `alone` for so many s, as fast as it can, before it waits for the first state.
+    """
     ports = (protocol.STATE_PORT, protocol.STICKS_PORT)
     program = Program("betaflight", protocol.MOTORS_PORT, ports, APART if lockstep else 0)
     if not lockstep:
         return program, {}
-    library = program.library(_SOURCE)
-    return program, {"LD_PRELOAD": library, "BETAFLIGHT_APART": str(program.moved)}
+    environment = {"LD_PRELOAD": program.library(_SOURCE), "BETAFLIGHT_LOCKSTEP": str(alone)}
+    return program, environment | {"BETAFLIGHT_APART": str(program.moved)}
 
 
 def _connected(port: int, deadline: float) -> socket.socket:
@@ -123,14 +130,14 @@ def _connected(port: int, deadline: float) -> socket.socket:
             time.sleep(0.01)
 
 
-def _told(link: socket.socket, command: str, end: str = "# ") -> str:
-    """The answer of its CLI to a command."""
-    link.sendall(f"{command}\r\n".encode())
+def _told(link: socket.socket, *commands: str, end: str = _PROMPT) -> str:
+    """The answer of its CLI to commands, a prompt for each of them."""
+    link.sendall("".join(f"{command}\r\n" for command in commands).encode())
     answer = ""
     deadline = time.monotonic() + ANSWER
-    while not answer.endswith(end):
+    while not answer.endswith(end) or answer.count(end) < len(commands):
         if time.monotonic() > deadline:
-            raise TimeoutError(f"no end of its answer to {command!r}")
+            raise TimeoutError(f"no end of its answer to {commands[-1]!r}")
         try:
             part = link.recv(4096)
         except TimeoutError:
@@ -139,8 +146,11 @@ def _told(link: socket.socket, command: str, end: str = "# ") -> str:
         if not part:
             break
         answer += part.decode(errors="replace")
-    if "###ERROR" in answer:
-        raise InputError(f"betaflight: expected that it takes {command!r}, got {answer.strip()!r}")
+    for command, said in zip(commands, answer.split(_PROMPT), strict=False):
+        if "###ERROR" in said:
+            raise InputError(
+                f"betaflight: expected that it takes {command!r}, got {said.strip()!r}"
+            )
     return answer
 
 
@@ -150,7 +160,7 @@ def configured(path: Path | None, commands: tuple[str, ...], lockstep: bool) -> 
 
     Raises `InputError`, or `PeerSilent`.
     """
-    program, environment = new_program(lockstep)
+    program, environment = new_program(lockstep, FOREVER)
     with closing(program):
         program.start(path, environment=environment)
         deadline = time.monotonic() + ANSWER if path else math.inf
@@ -159,9 +169,9 @@ def configured(path: Path | None, commands: tuple[str, ...], lockstep: bool) -> 
                 _told(link, "#")  # it wants silence behind this, 0.1 s of its clock
                 link.settimeout(0.05)
                 version = protocol.version_of(_told(link, "version"))
-                for command in commands:
-                    _told(link, command)
-                _told(link, "save", "Rebooting")
+                for first in range(0, len(commands), AT_ONCE):
+                    _told(link, *commands[first : first + AT_ONCE])
+                _told(link, "save", end="Rebooting")
             return Firmware(version, (program.folder / _MEMORY).read_bytes())
         except OSError as error:
             raise program.silent(f"its CLI, got none: {error}") from None
@@ -206,10 +216,7 @@ class Betaflight(Stack):
         program, environment = new_program(not real_time)
         super().__init__(program, rotors)
         (program.folder / _MEMORY).write_bytes(memory)
-        own_period = config.control_period
-        if not real_time:
-            own_period = None
-            environment["BETAFLIGHT_LOCKSTEP"] = "1"
+        own_period = config.control_period if real_time else None
         program.start(path, environment=environment, period=own_period)
         program.meet(self._read)
 

@@ -5,8 +5,9 @@
  * came. There the library sends the motors once, and the thread waits for the next state. So the
  * program computes as much as between two states of a real flight, however long that takes.
  *
- * BETAFLIGHT_LOCKSTEP in the environment switches that on. BETAFLIGHT_APART is added to all ports,
- * so that several programs run side by side.
+ * BETAFLIGHT_LOCKSTEP in the environment switches that on: its value is the time, s, after which the
+ * clock stops for the first state. BETAFLIGHT_APART is added to all ports, so that several programs
+ * run side by side.
  *
  * States come in a thread, sticks in another. Sticks that were sent before a state are taken over
  * before the clock goes on. In what the program reads, the stamp is constant: its own measurement
@@ -28,7 +29,7 @@
 #include <unistd.h>
 
 enum { MOTORS = 9001, SERVOS = 9002, STICKS = 9004, STATE_SIZE = 18 * 8, MOTORS_SIZE = 68 };
-static const int64_t SECOND = 1000000000, BOOT = 2000000000, TICK = 1000; /* ns */
+static const int64_t SECOND = 1000000000, TICK = 1000; /* ns */
 
 static int lockstep, apart;
 
@@ -54,11 +55,11 @@ __attribute__((constructor)) static void begin(void)
 {
     send_on = dlsym(RTLD_NEXT, "sendto");
     receive = dlsym(RTLD_NEXT, "recvfrom");
-    lockstep = getenv("BETAFLIGHT_LOCKSTEP") != NULL;
-    const char *given = getenv("BETAFLIGHT_APART");
+    const char *boot = getenv("BETAFLIGHT_LOCKSTEP"), *given = getenv("BETAFLIGHT_APART");
+    lockstep = boot != NULL;
     apart = given ? atoi(given) : 0;
     shown = now;
-    end = now + BOOT;
+    end = now + (boot ? atoll(boot) : 0) * SECOND;
 }
 
 static int is_main(void)

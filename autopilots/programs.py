@@ -11,6 +11,7 @@ import time
 import weakref
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, suppress
+from functools import cache
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Final, TypeVar
@@ -204,19 +205,26 @@ class Program:
 
     def library(self, source: Path) -> str:
         """Path of a shared library of a C file, in the folder. Raises `InputError`."""
-        compiler = shutil.which("cc") or shutil.which("gcc")
-        if compiler is None:
-            raise InputError(
-                "autopilot: expected a C compiler for lock-step, got none: install gcc"
-            )
-        library = str(self.folder / f"{source.stem}.so")
-        words = (compiler, "-O2", "-shared", "-fPIC", "-o", library, source, "-ldl", "-lpthread")
-        subprocess.run(words, check=True)
-        return library
+        library = self.folder / f"{source.stem}.so"
+        library.write_bytes(_compiled(source))
+        return str(library)
 
     def close(self) -> None:
         """End it. It may be called again."""
         self._end()
+
+
+@cache
+def _compiled(source: Path) -> bytes:
+    """A shared library of a C file. Raises `InputError`."""
+    compiler = shutil.which("cc") or shutil.which("gcc")
+    if compiler is None:
+        raise InputError("autopilot: expected a C compiler for lock-step, got none: install gcc")
+    with TemporaryDirectory() as folder:
+        library = Path(folder) / "library"
+        words = (compiler, "-O2", "-shared", "-fPIC", "-o", library, source, "-ldl", "-lpthread")
+        subprocess.run(words, check=True)
+        return library.read_bytes()
 
 
 def arrived(link: socket.socket) -> Iterator[tuple[bytes, tuple[str, int]]]:
