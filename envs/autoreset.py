@@ -2,7 +2,7 @@
 
 from abc import abstractmethod
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from gymnasium.vector import AutoresetMode, VectorEnv
@@ -26,7 +26,29 @@ Observation = Any
 Step = tuple[Observation, Array, Array, Array, Info]
 Content = tuple[Mapping[str, Array], Mapping[str, Array]]
 """Telemetry and terms of the reward by name, float64, shape (N, n) and (N,)."""
-Told = Callable[[], Content]
+
+
+class Told(NamedTuple):
+    """What a step told, for whoever asks later."""
+
+    read: Callable[[Sequence[Any]], Content]
+    """Reads moments of several steps: arrays with an axis of steps before the others."""
+    moment: Any
+
+    def __call__(self) -> Content:
+        telemetry, terms = self.read((self.moment,))
+        return {name: x[0] for name, x in telemetry.items()}, {n: x[0] for n, x in terms.items()}
+
+
+def stacked(moments: Sequence[Content]) -> Content:
+    """Reads moments that are contents."""
+    telemetry, terms = (
+        {name: np.array([row[name] for row in rows]) for name in rows[0]}
+        for rows in zip(*moments, strict=True)
+    )
+    return telemetry, terms
+
+
 Observer = Callable[["AdvancingVectorEnv", Array | None], None]
 Seeds = Sequence[int | None] | Array
 """A seed for each drone; None leaves its stream of random numbers as it is."""
@@ -154,7 +176,7 @@ class AdvancingVectorEnv(Asking, VectorEnv[Observation, ArrayLike, Array]):
 
     def _info(self, mask: Array) -> Info:
         """The telemetry of the drones by its components, each name with its mask."""
-        told = self._told()
+        told = self.told()
         spec = self.env_spec
         losses = self._losses()
 
@@ -167,10 +189,9 @@ class AdvancingVectorEnv(Asking, VectorEnv[Observation, ArrayLike, Array]):
 
         return LazyInfo(made)
 
-    def _told(self) -> Told:
-        """Gives telemetry and terms of the reward as they are now, also later."""
-        telemetry = self.telemetry
-        return lambda: (telemetry, {})
+    def told(self) -> Told:
+        """Telemetry and terms of the reward as they are now, for later."""
+        return Told(stacked, (self.telemetry, {}))
 
 
 def worlds_done(out: Array, drones: int) -> Array:

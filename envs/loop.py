@@ -16,7 +16,7 @@ from ..sim import Array, PhysicsError, World, make_world
 from ..sim.sensors.instruments import Moment
 from ..sim.snapshots import Arrays, Snapshot, joined, part_of
 from ..sim.state import ByName, found, is_traced, some
-from .autoreset import Content, Seed, Seeds, Told, checked_seeds
+from .autoreset import Content, Seed, Seeds, Told, checked_seeds, stacked
 from .config import EnvConfig
 from .events import BALL, balls_of
 from .pipeline import Pipeline
@@ -364,16 +364,11 @@ class Loop:
         return self._content[0]
 
     def told(self) -> Told:
-        """Gives telemetry and terms of the reward as they are now, also later."""
+        """Telemetry and terms of the reward as they are now, for later."""
         if self._told is None:
-            terms = self._begun().terms
-            quantities = telemetry_of(self)
             count = self.num_envs
-
-            def told() -> Content:
-                return _per_drone(quantities, count, -1), _per_drone(terms, count)
-
-            self._told = told
+            terms = _per_drone(self._begun().terms, count)
+            self._told = Told(stacked, (_per_drone(telemetry_of(self), count, -1), terms))
         return self._told
 
     def _begun(self) -> Record:

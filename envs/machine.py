@@ -20,7 +20,7 @@ from ..sim.compile.llvm import Region, compiled, widest
 from ..sim.snapshots import Arrays, Snapshot, joined, part_of
 from ..sim.state import ByName
 from ..sim.world import Call
-from .autoreset import Array, Seeds, Told
+from .autoreset import Array, Content, Seeds, Told
 from .derivative import Before, Derivative, variables
 from .loop import Loop
 from .stages.record import Mask, Record
@@ -195,7 +195,7 @@ class Machine:
                 self._begin(begun)
             self._take(self._world.told())
         self._call(_LAST)
-        return np.ndarray((), self._results, new), lambda: self._read(new)
+        return np.ndarray((), self._results, new), Told(self._read, new)
 
     def moment(self, results: Array) -> ByName:
         """As `Loop._moment` after a step."""
@@ -276,17 +276,20 @@ class Machine:
             if values is not None and values.ndim:
                 self.memory.put(name, values)
 
-    def _read(self, content: Array) -> tuple[Named, Named]:
-        """Telemetry and terms of the reward, float64, shape (N, n) and (N,), of a step."""
+    def _read(self, moments: Sequence[Array]) -> Content:
+        """Telemetry and terms of the reward, float64, shape (K, N, n) and (K, N), of K steps."""
         telemetry = {}
         terms = {}
         drones = self._world.shape[1]
+        size = self.memory.blocks * self._told.size
+        content = np.concatenate([moment[:size] for moment in moments])
         for name in self._told.fields:
-            view = self._told.view(name, content, self.memory.blocks)
-            values = view.astype(np.float64, order="C").reshape(self.memory.size * drones, -1)
-            flat = values[: self._worlds * drones]
+            view = self._told.view(name, content, len(moments) * self.memory.blocks)
+            values = view.astype(np.float64, order="C")
+            values = values.reshape(len(moments), self.memory.size * drones, -1)
+            flat = values[:, : self._worlds * drones]
             if name.startswith(_TERM):
-                terms[name.removeprefix(_TERM)] = flat[:, 0]
+                terms[name.removeprefix(_TERM)] = flat[:, :, 0]
             else:
                 telemetry[name.removeprefix(_TOLD)] = flat
         return telemetry, terms

@@ -128,7 +128,8 @@ class LocalVectorEnv(AdvancingVectorEnv, VectorEnv[Observation, ArrayLike, Array
         """By name, float64, shape (N, *shape). Raises `ResetNeeded` before the first reset."""
         return self.loop.telemetry
 
-    def _told(self) -> Told:
+    def told(self) -> Told:
+        """See the base."""
         return self.loop.told()
 
     def _take_results(self) -> None:

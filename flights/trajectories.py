@@ -31,7 +31,6 @@ if TYPE_CHECKING:
 Floats = NDArray[np.float64]
 
 _EVALUATION = 20230324  # the day the paper appeared
-_OBSERVED = "observation: "
 _SIZE = (40.0, 40.0)  # m: square about the z axis that counts of a scene without a size
 
 EpisodeSet = Literal["final", "curve", "tuning"]
@@ -243,7 +242,8 @@ def _fly_batch(
     policies = _begun(env, policy, seeds)
     used = len(policies)
     wanted = [array.name for array in env.env_spec.observation if array.name in observations]
-    rows = [_row(env, wanted)]
+    told = [env.told()]
+    seen = [_seen(env, wanted)]
     rewards = []
     actions = []
     lengths = np.zeros(env.num_envs, int)
@@ -256,7 +256,8 @@ def _fly_batch(
         while not some(ended):
             chosen = _act(env, policies, flying)
             env.advance(chosen, frozen=frozen)
-            rows.append(_row(env, wanted))
+            told.append(env.told())
+            seen.append(_seen(env, wanted))
             rewards.append(env.rewards)
             actions.append(chosen)
             ended = (env.terminated | env.truncated) & ~done
@@ -264,7 +265,8 @@ def _fly_batch(
         terminated = terminated | (env.terminated & ended)
         lost = lost | (env.lost & ended)
         done = done | ended
-    arrays = {name: np.array([row[name] for row in rows]) for name in rows[0]}
+    telemetry, _ = told[0].read([step.moment for step in told])
+    observed = {name: np.array([row[name] for row in seen]) for name in wanted}
     all_rewards = np.array(rewards)
     all_actions = np.array(actions)
     episodes = list(seeds)
@@ -274,11 +276,10 @@ def _fly_batch(
     for drone in np.flatnonzero(~spoiled[:used]).tolist():
         episode = episodes[drone // drones]
         steps = lengths[drone]
-        rows_of = {name: array[: steps + 1, drone] for name, array in arrays.items()}
         trajectory = Trajectory(
             spec=env.env_spec,
-            observations={name: rows_of.pop(_OBSERVED + name) for name in wanted},
-            telemetry=rows_of,
+            observations={name: rows[: steps + 1, drone] for name, rows in observed.items()},
+            telemetry={name: rows[: steps + 1, drone] for name, rows in telemetry.items()},
             rewards=all_rewards[:steps, drone],
             actions=all_actions[:steps, drone],
             ending="terminated" if terminated[drone] else "truncated",
@@ -304,12 +305,12 @@ def _begun(
     return policies
 
 
-def _row(env: AdvancingVectorEnv, wanted: Sequence[str]) -> Mapping[str, Array]:
-    """The present telemetry, and some arrays of the observations, which may have its names."""
+def _seen(env: AdvancingVectorEnv, wanted: Sequence[str]) -> Mapping[str, Array]:
+    """Some arrays of the present observations."""
     seen = env.observations
     if not isinstance(seen, Mapping):
         seen = dict.fromkeys(wanted, seen)
-    return {**env.telemetry, **{_OBSERVED + name: seen[name] for name in wanted}}
+    return {name: seen[name] for name in wanted}
 
 
 def _act(
