@@ -196,7 +196,6 @@ def remote_env(
                 "key-file, insecure: expected them with --listen, "
                 "got them for a simulator of our own on this machine"
             )
-        task_type(env_id)  # raises for one that is not known here
         config = command.env_config(backend=backend or command.backend)
         drones = num_envs or command.drones
         opened = spawn_simulator(config, num_envs=drones, record=command.record)

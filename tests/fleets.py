@@ -1,6 +1,6 @@
 """A RemoteVectorEnv for the tests, its simulators, and local envs to compare it with."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
 from typing import Any
 
@@ -22,7 +22,11 @@ NAMES = [name for array in SPEC.telemetry for name in component_names(array)]
 
 @contextmanager
 def flying(
-    simulators: int, drones: int, env: str = ENV_ID, autoreset: str = "NextStep", **options: Any
+    simulators: int,
+    drones: int,
+    env: str | Callable[[], gym.Env[Any, Any]] = ENV_ID,
+    autoreset: str = "NextStep",
+    **options: Any,
 ) -> Iterator[tuple[RemoteVectorEnv, list[Running]]]:
     """A RemoteVectorEnv, and simulators for it in threads."""
     remote = RemoteVectorEnv(
@@ -32,7 +36,10 @@ def flying(
         autoreset_mode=autoreset,
         connect=False,
     )
-    running = [simulate(remote, num_envs=drones, env=env, **options) for _ in range(simulators)]
+    running = []
+    for _ in range(simulators):
+        made = env() if callable(env) else env
+        running.append(simulate(remote, num_envs=drones, env=made, **options))
     try:
         yield remote, running
     finally:

@@ -71,7 +71,7 @@ class Broken(gym.Env[np.ndarray, np.ndarray]):
 
     observation_space = spaces.Box(-1, 1, (1,), np.float32)
     action_space = spaces.Box(-1, 1, (1,), np.float32)
-    spec = SimpleNamespace(id=ENV_ID)  # type: ignore[assignment]
+    spec = SimpleNamespace(id=ENV_ID, kwargs={})  # type: ignore[assignment]
 
     def __init__(self, value: float | None) -> None:
         self.value = value

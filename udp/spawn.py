@@ -116,11 +116,10 @@ def start_simulator(
 
 
 def _importable(config: EnvConfig) -> EnvConfig:
-    """The config with the content of its files. Raises `InputError` for a task that the simulator's
-    process cannot import.
+    """The config with the content of its files. Raises `InputError` for a task that is not known
+    here, or that the simulator's process cannot import.
     """
-    known = registry.is_known(config.env_id)
-    if known and registry.task_type(config.env_id).__module__ == "__main__":
+    if registry.task_type(config.env_id).__module__ == "__main__":
         raise InputError(
             "env: expected a task of a module, for the simulator's process to import, got "
             f"{config.env_id} of this program"

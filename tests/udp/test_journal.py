@@ -18,6 +18,7 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
 import pytest
 import zstandard
@@ -274,7 +275,8 @@ def changed_spec(**values: Any) -> Callable[[Message], Message]:
 def test_a_flight_of_another_env_is_recorded_and_not_repeated(tmp_path: Path) -> None:
     path = tmp_path / "pole.mcap"
     remote = RemoteEnv(ANY, env_id="CartPole-v1", connect=False, **TIMES)
-    running = simulate(remote, env="CartPole-v1", record=path, sutton_barto_reward=True)
+    pole = gym.make("CartPole-v1", sutton_barto_reward=True)
+    running = simulate(remote, env=pole, record=path)
     with remote:
         fly(remote, 60)
     running.join()
@@ -298,7 +300,7 @@ def test_a_flight_that_never_began(tmp_path: Path) -> None:
 def test_a_refused_simulator(tmp_path: Path) -> None:
     path = tmp_path / "refused.mcap"
     with RemoteEnv(ANY, env_id=ENV_ID, connect=False, timeout=5, connect_timeout=1) as remote:
-        running = simulate(remote, env="CartPole-v1", record=path)
+        running = simulate(remote, env=gym.make("CartPole-v1"), record=path)
         with pytest.raises(PeerSilent):
             remote.connect()
         assert isinstance(running.join(), Refused)

@@ -42,9 +42,13 @@ def test_parity_of_episodes_that_end_at_different_times() -> None:
         assert assert_parity(remote, local, 500) > 40
 
 
+def pole() -> gym.Env[Any, Any]:
+    return gym.make("CartPole-v1")
+
+
 def test_another_env_of_gymnasium_flies_too() -> None:
     local = gym.make_vec("CartPole-v1", num_envs=4, vectorization_mode="sync")
-    with flying(4, 1, env="CartPole-v1") as (remote, _), closing(local):
+    with flying(4, 1, env=pole) as (remote, _), closing(local):
         assert_same(remote.reset(seed=3), local.reset(seed=3))
         dice = np.random.default_rng(0)
         for _ in range(100):
@@ -336,7 +340,7 @@ def test_states_larger_than_the_systems_buffer(monkeypatch: pytest.MonkeyPatch) 
 
 
 def test_an_env_of_others_is_held_too() -> None:
-    with flying(2, 1, env="CartPole-v1", autoreset="SameStep") as (remote, _):
+    with flying(2, 1, env=pole, autoreset="SameStep") as (remote, _):
         remote.reset(seed=0)
         push = np.array([1, 0])
         for _ in range(60):

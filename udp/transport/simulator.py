@@ -32,7 +32,7 @@ from ..protocol.party import (
 )
 from ..protocol.running import FreeRun, FreeRunning
 from .sockets import EVENTS_WAY_OUT, LONGEST_WAIT, PAUSE, TEXT_WAY_OUT, WAY_OUT, Port, resolve
-from .stepped import GymEnv, GymnasiumWorld, Steppable, make_stepped
+from .stepped import GymEnv, Steppable, make_stepped
 
 if TYPE_CHECKING:
     from ..journal import Journal
@@ -61,7 +61,7 @@ class Simulator(NotCopied):
     bit. The rules are those of `SeveralAgents`.
 
     Args:
-        env: `EnvConfig`, id of a registered env, or one Gymnasium env itself: observations are a
+        env: `EnvConfig`, id of a registered task, or one Gymnasium env itself: observations are a
             Box or a Dict of Box, actions a Box or `Discrete`.
         server: Address (host, port) of the agent.
         agents: Addresses of several agents in its place. They share the drones evenly in their
@@ -147,8 +147,6 @@ class Simulator(NotCopied):
                 self.rules = _free_running(stepped, layout, links, free_run)
             elif agents is None:
                 self.rules = OneAgent(stepped, layout, spec.control_period, links)
-            elif isinstance(stepped, GymnasiumWorld):
-                raise InputError(f"env: expected a registered task for several drones, got {env!r}")
             else:
                 self.rules = SeveralAgents(stepped, layout, spec.control_period, links, patience)
             if record:

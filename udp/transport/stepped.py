@@ -36,7 +36,7 @@ def make_stepped(
     """N drones of an env. Raises `InputError` if its spaces or an argument are not right.
 
     Args:
-        env: Config, id of a registered task or of an env of Gymnasium, or one env itself.
+        env: Config, id of a registered task, or one Gymnasium env itself.
         num_envs: N, a multiple of the drones of a world; None: one world. Of an env that is no task
             of ours there is one.
         keywords: As of `EnvConfig.from_keywords`, with an id.
@@ -45,30 +45,18 @@ def make_stepped(
         if keywords or num_envs not in (None, 1):
             got = ", ".join(keywords) or f"num_envs = {num_envs}"
             raise InputError(f"env: expected one env without keywords, got {got}")
-        return GymnasiumWorld(env, {})
-    env = EnvConfig.from_keywords(env, **keywords)
-    drones = env.drones
+        return GymnasiumWorld(env)
+    config = EnvConfig.from_keywords(env, **keywords)
+    registry.task_type(config.env_id)  # raises for one that is not known here
+    drones = config.drones
     count = check("num_envs", DRONES, drones if num_envs is None else num_envs)
     if count % drones:
         raise InputError(f"drones: expected a divisor of num_envs = {count}, got {drones}")
-    if registry.is_known(env.env_id):
-        from ...envs.compiled import make_loop
+    from ...envs.compiled import make_loop
 
-        loop = make_loop(env, count // drones)
-        loop.prepare()
-        return loop
-    if count > 1 or env != EnvConfig(env_id=env.env_id, task=env.task):
-        raise InputError(
-            f"vehicle, backend, drones, num_envs: expected none for {env.env_id!r}, which is no "
-            "task of ours"
-        )
-    try:
-        made = gym.make(env.env_id, disable_env_checker=True, **env.task)
-    except (gym.error.Error, ImportError) as error:
-        raise InputError(f"env: expected a registered id, got {env.env_id!r}: {error}") from None
-    except TypeError as error:
-        raise InputError(f"options of {env.env_id}: {error}") from None
-    return GymnasiumWorld(made, env.task)
+    loop = make_loop(config, count // drones)
+    loop.prepare()
+    return loop
 
 
 class GymnasiumWorld:
@@ -76,8 +64,8 @@ class GymnasiumWorld:
 
     num_envs = 1
 
-    def __init__(self, env: GymEnv, options: Mapping[str, object]) -> None:
-        self.spec = spec = spec_of_gymnasium(env, options)
+    def __init__(self, env: GymEnv) -> None:
+        self.spec = spec = spec_of_gymnasium(env)
         self.observations = {a.name: np.zeros((1, *a.shape), a.dtype) for a in spec.observation}
         self.telemetry = {a.name: np.zeros((1, *a.shape)) for a in spec.telemetry}
         self.rewards = np.zeros(1)
@@ -131,8 +119,11 @@ class GymnasiumWorld:
             self.telemetry[array.name][0] = np.reshape(numbers, array.shape)
 
 
-def spec_of_gymnasium(env: GymEnv, options: Mapping[str, object]) -> EnvSpec:
-    """The env's own spec, or one from its spaces. `InputError`: one cannot cross the wire."""
+def spec_of_gymnasium(env: GymEnv) -> EnvSpec:
+    """The env's own spec, or one from its spaces, with the keywords of `gymnasium.make` as options.
+
+    Raises `InputError` if one cannot cross the wire.
+    """
     base = env.unwrapped
     observation = env.observation_space
     boxes = observation.spaces if isinstance(observation, spaces.Dict) else {"": observation}
@@ -149,7 +140,7 @@ def spec_of_gymnasium(env: GymEnv, options: Mapping[str, object]) -> EnvSpec:
     fps = env.metadata.get("render_fps") or 50
     return EnvSpec(
         env_id=canonical_id(env.spec.id) if env.spec else type(base).__name__,
-        options=dict(options),
+        options=env.spec.kwargs if env.spec else {},
         control_period=float(getattr(base, "control_period", 1 / fps)),
         observation=arrays,
         action=action,
