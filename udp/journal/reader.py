@@ -1,11 +1,9 @@
 """Reads and summarizes a journal, whole or cut off."""
 
-import json
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass
 from datetime import UTC, datetime
-from functools import cached_property
 from pathlib import Path
 from typing import BinaryIO, NamedTuple
 
@@ -19,7 +17,7 @@ from ...models.errors import InputError, printable, shortened
 from ..layouts import layout_of
 from ..protocol import binary
 from ..protocol.errors import DecodeError
-from ..protocol.layout import MAX_MESSAGE, Layout
+from ..protocol.layout import MAX_MESSAGE
 from ..protocol.messages import (
     Close,
     Command,
@@ -36,20 +34,26 @@ from .writer import ABOUT, FORMAT
 MAX_CHUNK = 2 * MAX_MESSAGE
 """Most bytes of a record or of a decompressed chunk that is read. Ours are of 64 KiB, or of one
 message and 256 KiB where that is longer."""
-_TOPIC = re.compile(r"/slot([0-9]{1,9})/(state|command|events)")
+_TOPIC = re.compile(r"/slot([0-9]{1,9})")
 
 
 @dataclass(eq=False)
 class Session:
-    """One simulator at one slot of an agent, from its Hello on."""
+    """One simulator at one slot of an agent, from its Hello on.
+
+    Attributes:
+        spec: Of the env that is flown.
+        layout: Of the States and Commands.
+
+    Raises:
+        InputError: The spec of the Hello is wrong.
+    """
 
     index: int
     """Counts the sessions of the file, from 1."""
     slot: int
     hello: Hello
     """By text a simulator says none, and records one of its own."""
-    codec: str
-    """`binary` or `text`."""
     first: int
     """Time of its first message, nanoseconds since 1970."""
     last: int = 0
@@ -62,15 +66,9 @@ class Session:
     _command: Command | None = None
     _sequence: int | None = None  # of the last State
 
-    @cached_property
-    def spec(self) -> EnvSpec:
-        """Of the env that is flown."""
-        return EnvSpec.from_json(self.hello.spec)
-
-    @cached_property
-    def layout(self) -> Layout:
-        """Of the States and Commands."""
-        return layout_of(self.spec, self.hello.worlds)
+    def __post_init__(self) -> None:
+        self.spec = EnvSpec.from_json(self.hello.spec)
+        self.layout = layout_of(self.spec, self.hello.worlds)
 
     @property
     def num_envs(self) -> int:
@@ -122,7 +120,7 @@ class Session:
         began = datetime.fromtimestamp(self.first // 10**9, UTC)
         seconds = (self.last - self.first) / 1e9
         return (
-            f"{self}: {count_of(self.num_envs, 'drone')} of {self.spec.env_id}, {self.codec}, "
+            f"{self}: {count_of(self.num_envs, 'drone')} of {self.spec.env_id}, "
             f"{began:%Y-%m-%d %H:%M:%S} UTC, {seconds:.1f} s, {self.states} States; {self.ending}"
         )
 
@@ -154,7 +152,7 @@ class Recording:
 
     Attributes:
         path: The file.
-        about: Metadata of its head: side, versions; of a simulator also config and backend.
+        about: Metadata of its head: side, versions; of a simulator also codec, config and backend.
         complete: Whether the file was finished, and could be read as far as was tried.
         ending: How it ends, in words.
 
@@ -186,42 +184,34 @@ class Recording:
             )
 
     def __iter__(self) -> Iterator[Item]:
-        topics: dict[int, tuple[int, str]] = {}
+        slots: dict[int, int] = {}  # by id of the channel
         sessions: dict[int, Session] = {}
         count = 0
         for record in self._records():
             if isinstance(record, records.Channel):
                 if match := _TOPIC.fullmatch(record.topic):
-                    topics[record.id] = int(match[1]), match[2]
-            elif isinstance(record, records.Message) and record.channel_id in topics:
-                slot, topic = topics[record.channel_id]
+                    slots[record.id] = int(match[1])
+            elif isinstance(record, records.Message) and record.channel_id in slots:
+                slot = slots[record.channel_id]
                 session = sessions.get(slot)
-                datagram = record.data
-                words: dict[str, str] = {}
+                layout = session.layout if session else None
                 try:
-                    if topic == "events":
-                        words = json.loads(datagram)
-                        datagram = bytes.fromhex(words["datagram"])
-                    layout = session.layout if session else None
-                    message = binary.decode(datagram, layout)
+                    message = binary.decode(record.data, layout)
                     if isinstance(message, Hello):
-                        layout_of(EnvSpec.from_json(message.spec), message.worlds)
-                except (ValueError, KeyError, TypeError, RecursionError, DecodeError) as error:
+                        count += 1
+                        session = Session(count, slot, message, record.log_time)
+                        sessions[slot] = session
+                except (InputError, DecodeError) as error:
                     raise InputError(
                         f"{self.path}: a message that cannot be read: {error}"
                     ) from None
-                if isinstance(message, Hello):
-                    count += 1
-                    codec = words.get("codec", "")
-                    session = Session(count, slot, message, codec, record.log_time)
-                    sessions[slot] = session
-                elif session is None or message.session != session.hello.session:
+                if session is None or message.session != session.hello.session:
                     raise InputError(
                         f"{self.path}: expected a message of the session of the last Hello, "
                         f"got a {type(message).__name__} of {message.session:016x}"
                     )
                 command = session.take(message, record.log_time)
-                yield Item(session, record.log_time, message, datagram, command)
+                yield Item(session, record.log_time, message, record.data, command)
 
     def _records(self) -> Iterator[records.McapRecord]:
         with self.path.open("rb") as file:

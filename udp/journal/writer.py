@@ -1,10 +1,8 @@
 """Writes the journal of a flight: every message once, in an MCAP file. See `docs/journal.md`.
 
-A State or a Command is written as its whole binary message. All other messages are JSON with the
-message in it as hexadecimal digits.
+A message is written as its whole datagram of the binary codec.
 """
 
-import json
 import os
 import platform
 import signal
@@ -19,11 +17,11 @@ from typing import Any
 from mcap.writer import Writer
 
 from ...models.files import removed_on_error, software_versions
-from ..protocol.messages import Command, Hello, Message, State
+from ..protocol.messages import Message
 from ..protocol.statistics import warn
 
 ABOUT = "rotorgram"  # name of the metadata about the whole file
-FORMAT = "4"  # version of the file's content, beside the protocol's in each datagram
+FORMAT = "5"  # version of the file's content, beside the protocol's in each datagram
 
 _CHUNK = 1 << 16  # bytes; 2 ms to write
 _SECOND = 10**9
@@ -41,7 +39,6 @@ class Journal:
     Args:
         path: The file; it must not exist.
         side: `simulator` or `agent`.
-        codec: Of the sessions.
         about: More metadata of the head, by name.
 
     Raises:
@@ -50,22 +47,16 @@ class Journal:
     """
 
     def __init__(
-        self,
-        path: Path | str,
-        *,
-        side: str,
-        codec: str = "binary",
-        about: Mapping[str, str] | None = None,
+        self, path: Path | str, *, side: str, about: Mapping[str, str] | None = None
     ) -> None:
         self._path = Path(path)
-        self._codec = codec
         self._pid = os.getpid()
         self._closed = False
         self._pending: list[tuple[int, int, int, bytes]] = []
         """Messages of the next chunk: channel, nanoseconds since 1970, sequence number, data."""
         self._size = 0  # bytes of these
         self._flushed = time.time_ns()
-        self._channels: dict[str, int] = {}  # ids by topic
+        self._channels: dict[int, int] = {}  # ids by slot
         versions = software_versions() | {"machine": platform.machine()}
         head = {f"version of {name}": number for name, number in versions.items()}
         head |= {"format": FORMAT, "side": side, **(about or {})}
@@ -79,22 +70,16 @@ class Journal:
         self._writer = writer
         with removed_on_error(self._path), self._writing():
             writer.start("", f"rotorgram {versions.get('rotorgram', '')}")
-            self._event_schema = writer.register_schema(
-                "rotorgram.Event", "jsonschema", b'{"type": "object"}'
-            )
             writer.add_metadata(ABOUT, head)
 
     def tap(self, slot: int, message: Message, datagram: bytes) -> None:
         """Queue a message, as a `Tap`; `write` writes it."""
         if self._closed:
             return
-        now = time.time_ns()
-        if isinstance(message, State | Command):
-            channel = self._channel(f"/slot{slot}/{type(message).__name__.lower()}", "rotorgram")
-            self._pending.append((channel, now, message.sequence, datagram))
-        else:
-            channel = self._channel(f"/slot{slot}/events", "json")
-            self._pending.append((channel, now, 0, self._event(message, datagram)))
+        if slot not in self._channels:
+            self._channels[slot] = self._writer.register_channel(f"/slot{slot}", "rotorgram", 0)
+        sequence = getattr(message, "sequence", 0)
+        self._pending.append((self._channels[slot], time.time_ns(), sequence, datagram))
         self._size += len(datagram)
 
     def write(self) -> None:
@@ -113,13 +98,6 @@ class Journal:
                 self._flush(finish=True)
             finally:
                 self._file.close()
-
-    def _channel(self, topic: str, encoding: str) -> int:
-        """Id of the channel of a topic."""
-        if topic not in self._channels:
-            schema = self._event_schema if encoding == "json" else 0
-            self._channels[topic] = self._writer.register_channel(topic, encoding, schema)
-        return self._channels[topic]
 
     def _flush(self, *, finish: bool = False) -> None:
         """Write all messages as one chunk; where that fails, log why the journal ends here."""
@@ -154,17 +132,6 @@ class Journal:
                 with suppress(OSError):  # its buffer still holds bytes that a full device refused
                     self._file.raw.close()
                 raise
-
-    def _event(self, message: Message, datagram: bytes) -> bytes:
-        """A message for readers, with its datagram for programs."""
-        words = {"type": type(message).__name__, "session": f"{message.session:016x}"}
-        if isinstance(message, Hello):
-            words["codec"] = self._codec
-        for name in ("worlds", "spec", "seed", "sequence", "reason"):
-            if hasattr(message, name):
-                words[name] = getattr(message, name)
-        words["datagram"] = datagram.hex()
-        return json.dumps(words).encode()
 
 
 @contextmanager

@@ -293,11 +293,10 @@ class Simulator(NotCopied):
         from ..journal import Journal
 
         link = self.link
-        codec = "text" if link.by_text else "binary"
-        about = {}
+        about = {"codec": "text" if link.by_text else "binary"}
         if config := getattr(self.stepped, "config", None):  # a `Loop` has one
-            about = {"config": json.dumps(config.to_dict()), "backend": config.backend.name}
-        self._journal = Journal(path, side="simulator", codec=codec, about=about)
+            about |= {"config": json.dumps(config.to_dict()), "backend": config.backend.name}
+        self._journal = Journal(path, side="simulator", about=about)
         link.tap = self._journal.tap
         if link.by_text:  # says no Hello
             link.tap(0, link.hello, binary.encode(link.hello))
