@@ -19,13 +19,13 @@ class Mine(Hover):
 WRONG = {
     "        if height[0, 0] > 1.0: pass": r"not compiled, .*np.where\(\) \(`outcome`, line 9\)",
     '        outcome.reward["more"] = np.sin(height)': (
-        r"compiled code and NumPy differ in reward of step \d+, .*\(np\.sin, line 9\)"
+        r"compiled code and NumPy differ in reward of step \d+, .*: take sin, exp, .*\*\*, "
     ),
     '        outcome.reward["more"] = (height - 5.0) ** 3': (
-        r"compiled code and NumPy differ in reward of step \d+, .*\(\*\* 3, line 9\)"
+        r"compiled code and NumPy differ in reward of step \d+, .*: take sin, exp, .*\*\*, "
     ),
     '        outcome.reward["more"] = height + np.random.normal()': (
-        r"two flights of one seed differ in reward .*\(np\.random\.normal, line 9\)"
+        r"two flights of one seed differ in reward .*random numbers from `draw` alone"
     ),
     '        outcome.reward["more"] = height + np.inf': "expected finite numbers for reward, got ",
     '        outcome.metrics["more"] = self.nothing': r"AttributeError: .*\(`outcome`, line 9\)",
