@@ -16,28 +16,6 @@ if TYPE_CHECKING:
     from ..models.checks import Check
     from ..models.vehicle_file import VehicleFile
 
-_FRAME = """\
-frame = "{frame}"{space}# docs/vehicles.md has pictures of the frames
-arm = 0.25                        # m, from the body's origin to each rotor
-"""
-_LIST = """
-[[rotors.list]]                   # one for each rotor, in the order of actions
-position = [0.2, 0.2, 0.0]        # m, where its thrust acts
-axis = [0.0, 0.0, 1.0]            # of its thrust
-turn = "cw"                       # seen from above; it pushes the craft counterclockwise
-
-[[rotors.list]]
-position = [0.2, -0.2, 0.0]
-turn = "ccw"
-
-[[rotors.list]]
-position = [-0.2, -0.2, 0.0]
-turn = "cw"
-
-[[rotors.list]]
-position = [-0.2, 0.2, 0.0]
-turn = "ccw"
-"""
 _NEW = """\
 # A vehicle for rotorgram. It flies as it is; replace the numbers by those of your craft.
 # SI units; body axes x forward, y left, z up. docs/vehicles.md has every field.
@@ -49,12 +27,14 @@ inertia = [0.02, 0.02, 0.035]     # kg m²: Ixx, Iyy, Izz about the centre of ma
 center_of_mass = [0.0, 0.0, 0.0]  # m
 
 [rotors]
-{frame}thrust = {thrust:25}# N, least and largest of each rotor
+frame = {frame:26}# docs/vehicles.md has pictures of the frames
+arm = 0.25                        # m, from the body's origin to each rotor
+thrust = {thrust:25}# N, least and largest of each rotor
 reaction = 0.016                  # N m of torque per N of thrust
 # What effects and sensors need begins with #: take it away where you know the number.
 # radius = 0.11                   # m
 # time_constant = 0.05            # s, of the speed's first-order answer
-{listed}
+
 # [drag]
 # linear = [0.1, 0.1, 0.2]        # N s/m
 # quadratic = [0.02, 0.02, 0.04]  # N s²/m²
@@ -79,7 +59,7 @@ class Vehicle(Command):
     """TOML or MJCF file, or the name of a vehicle of the library."""
     out: Annotated[Positional[Path | None], arg(metavar="OUT.xml")] = None
     """MJCF file that `export` writes, a new one."""
-    frame: Literal["plus", "cross", "hexa", "octo", "list"] = "cross"
+    frame: Literal["plus", "cross", "hexa", "octo"] = "cross"
     """Arrangement of the rotors of `new`."""
 
     def run(self) -> int | None:
@@ -110,13 +90,8 @@ class Vehicle(Command):
         path = Path(self.file)
         check_new_file(path, ".toml")
         count = {"hexa": 6, "octo": 8}.get(self.frame, 4)
-        listed = self.frame == "list"
-        space = " " * (24 - len(self.frame))
-        text = _NEW.format(
-            frame="" if listed else _FRAME.format(frame=self.frame, space=space),
-            thrust=f"[0.0, {30.0 / count}]",  # twice the weight
-            listed=_LIST if listed else "",
-        )
+        thrust = f"[0.0, {30.0 / count}]"  # twice the weight
+        text = _NEW.format(frame=f'"{self.frame}"', thrust=thrust)
         write_whole(path, text)
         print(f"vehicle: {path} (rotorgram vehicle check {path} examines it)")
 
@@ -210,21 +185,15 @@ def print_checks(checks: Sequence["Check"]) -> None:
     from rich.markup import escape
     from rich.table import Table
 
-    console = Console()
-    wide = console.width >= 120
-    columns = ["", "check", "measured", "expected"] + ["equation", "source"] * wide
-    table = Table(*columns, box=SIMPLE_HEAD, pad_edge=False)
+    table = Table("", "check", "measured", "expected", box=SIMPLE_HEAD, pad_edge=False)
     for check in checks:
-        cells = (
+        table.add_row(
             "[green]ok" if check.passed else "[red]FAILED",
             escape(check.name),
             escape(f"{check.measured:.4g} {check.unit}".strip()),
             escape(expectation(check)),
-            escape(check.equation),
-            escape(check.source),
         )
-        table.add_row(*cells[: len(columns)])
-    console.print(table)
+    Console().print(table)
     for check in failed:
         print(f"{check.name}: {check.meaning}")
     print(f"{len(checks) - len(failed)} of {len(checks)} checks passed")

@@ -21,7 +21,7 @@ def vehicle(capsys: Capsys, *words: object) -> str:
     return output(capsys, "vehicle", *words)
 
 
-@pytest.mark.parametrize("frame", [*FRAMES, "list"])
+@pytest.mark.parametrize("frame", FRAMES)
 def test_a_new_file_flies_as_it_is(frame: str, tmp_path: Path, capsys: Capsys) -> None:
     file = tmp_path / "mine.toml"
     out = vehicle(capsys, "new", file, "--frame", frame)
@@ -36,7 +36,7 @@ def test_a_new_file_is_still_one_with_what_its_comments_offer(
     tmp_path: Path, capsys: Capsys
 ) -> None:
     file = tmp_path / "mine.toml"
-    vehicle(capsys, "new", file, "--frame", "list")
+    vehicle(capsys, "new", file)
     text = file.read_text(encoding="utf-8")
     offered = re.sub(r"^# (?=\[|\w+ = )", "", text, flags=re.MULTILINE)
     file.write_text(offered, encoding="utf-8")
@@ -51,7 +51,7 @@ def test_a_new_file_is_still_one_with_what_its_comments_offer(
 
 def test_the_frames_are_those_of_the_file() -> None:
     hint = get_type_hints(command.Vehicle)["frame"]
-    assert get_args(hint) == (*FRAMES, "list")
+    assert get_args(hint) == tuple(FRAMES)
 
 
 def test_show(tmp_path: Path, capsys: Capsys) -> None:
