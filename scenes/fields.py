@@ -82,11 +82,6 @@ def centered(heights: Array, depth: float) -> tuple[float, Array]:
     return middle, heights - middle
 
 
-def least_of(grid: Array | None) -> float:
-    """The least height of a field, 0 of another solid."""
-    return 0.0 if grid is None else float(grid.min())
-
-
 Table = tuple[tuple[float, ...], ...]
 
 

@@ -4,12 +4,11 @@ from collections.abc import Mapping, Sequence
 
 import mujoco
 import numpy as np
-from mujoco import MjModel, MjsGeom, MjSpec, mjtGeom
-from numpy.typing import ArrayLike, NDArray
+from mujoco import MjsGeom, MjSpec, mjtGeom
+from numpy.typing import ArrayLike
 
 from ..models.mjcf import add_ground, attach
 from . import kernels
-from .fields import least_of
 from .obstacles import hulls_of
 from .solids import Array, Solids
 
@@ -48,7 +47,7 @@ def add_geoms(
         )
         for number, name in enumerate(names)
     ]  # fmt: skip
-    for row, name in add_fields(spec, solids, "").items():
+    for row, name in _add_fields(spec, solids).items():
         geoms[row].hfieldname = name
     return geoms
 
@@ -63,44 +62,31 @@ def add_hulls(spec: MjSpec, content: str, settings: Mapping[str, float]) -> None
         )  # fmt: skip
 
 
-def add_fields(spec: MjSpec, solids: Solids, layout: str) -> dict[int, str]:
-    """Add the height fields of a layout to a spec. Gives their names by the numbers of solids."""
-    names = _fields(solids, layout)
-    for row, name in names.items():
+def _add_fields(spec: MjSpec, solids: Solids) -> dict[int, str]:
+    """Add the height fields of solids to a spec. Gives their names by the numbers of solids."""
+    names = {}
+    for row in np.flatnonzero(solids.kinds == kernels.HFIELD).tolist():
+        names[row] = f"{NAME}_{row}"
         grid = solids.grids[row]
         a, b, depth = solids.halves[row].tolist()
         low = grid.min()
         tall = max(grid.max() - low, _LEAST)
         rows, columns = grid.shape
         spec.add_hfield(
-            name=name, size=(a, b, tall, max(depth + low, _LEAST)), nrow=rows, ncol=columns,
+            name=names[row], size=(a, b, tall, max(depth + low, _LEAST)), nrow=rows, ncol=columns,
             userdata=((grid - low) / tall).ravel(),
         )  # fmt: skip
     return names
 
 
-def fields_of(
-    model: MjModel, solids: Solids, layout: str, count: int
-) -> dict[str, NDArray[np.int64]]:
-    """As `geoms_of`: which fields of a model with `add_fields` the geoms are, if any is one."""
-    names = _fields(solids, layout)
-    which = np.full(count, -1)
-    for row, name in names.items():
-        which[row] = model.hfield(name).id
-    return {"geom_dataid": which} if names else {}
-
-
-def _fields(solids: Solids, layout: str) -> dict[int, str]:
-    rows = np.flatnonzero(solids.kinds == kernels.HFIELD).tolist()
-    return {row: f"{NAME}{layout}_{row}" for row in rows}
-
-
 def geoms_of(solids: Solids, count: int) -> dict[str, np.ndarray]:
-    """Fields of so many geoms of a model by name, the first of which are these solids."""
+    """Fields of so many geoms of a model by name, the first of which are these solids. Reach and
+    box are not those of height fields, which MuJoCo's compiler finds.
+    """
     kinds = solids.kinds
     axes = solids.axes
     a, b, c = solids.halves.T
-    lows = np.array([least_of(grid) for grid in solids.grids])
+    lows = np.array([0.0 if grid is None else grid.min() for grid in solids.grids])
     quaternions = np.empty((len(solids), 4))
     for quaternion, turned in zip(quaternions, axes, strict=True):
         mujoco.mju_mat2Quat(quaternion, turned.ravel())
@@ -108,10 +94,8 @@ def geoms_of(solids: Solids, count: int) -> dict[str, np.ndarray]:
     first = np.choose(kinds, (a, a, a, a, 0.0, a))
     second = np.choose(kinds, (0.0, c - a, c, b, 0.0, b))
     third = np.choose(kinds, (0.0, 0.0, 0.0, c, 1.0, c))
-    deep = c + abs(lows)
-    furthest = np.sqrt(a * a + b * b + deep * deep)
+    furthest = np.sqrt(a * a + b * b + c * c)
     reach = np.choose(kinds, (c, c, np.sqrt(a * a + c * c), furthest, 0.0, furthest))
-    boxes = np.column_stack((0.0 * a, 0.0 * a, -lows, solids.halves))
 
     def filled(given: Array, other: ArrayLike) -> np.ndarray:
         """Numbers of the solids, and others of geoms that stand for nothing."""
@@ -125,5 +109,7 @@ def geoms_of(solids: Solids, count: int) -> dict[str, np.ndarray]:
         "geom_quat": filled(quaternions, _TURNED),
         "geom_size": filled(np.column_stack((first, second, third)), (0.1, 0.0, 0.0)),
         "geom_rbound": filled(reach, 0.1),
-        "geom_aabb": filled(boxes, (0.0, 0.0, 0.0, 0.1, 0.1, 0.1)),
+        "geom_aabb": filled(
+            np.pad(solids.halves, ((0, 0), (3, 0))), (0.0, 0.0, 0.0, 0.1, 0.1, 0.1)
+        ),
     }

@@ -23,7 +23,7 @@ from ...models.vehicle import (
     owners,
     payload_radius,
 )
-from ...scenes.geoms import NAME, add_fields, add_solids, fields_of, geoms_of
+from ...scenes.geoms import NAME, add_solids, geoms_of
 from ...scenes.kernels import HFIELD
 from ...scenes.solids import Solids
 from ..effects import EffectOptions
@@ -121,21 +121,18 @@ class MujocoWorld(World):
         )
 
     def _surround(self, spec: mujoco.MjSpec) -> None:
-        """Add geoms to a spec for what stands in its scene, of which the first layout is known."""
+        """Add geoms to a spec for what stands in its scene. Raises `InputError`."""
         scenery = self.scenery
         if scenery.scene.is_file:
             delete_obstacles(spec)
         fixed = Solids.none() if scenery.varies else scenery.solids(int(scenery.seeds[0]))
         add_solids(spec, fixed, scenery.most, scenery.scene.embedded().content)
-        if not scenery.varies:
-            return
-        if not scenery.given and (scenery.solids(0).kinds == HFIELD).any():
+        laid = [scenery.solids(seed) for seed in scenery.given or (0,)]
+        if scenery.varies and any((solids.kinds == HFIELD).any() for solids in laid):
             raise InputError(
-                "scene: expected a scene with height fields to have given seeds on mujoco, "
-                f"as hills:0-7, got {scenery.scene}"
+                "scene: expected height fields on mujoco in one layout, as hills:0, where "
+                f"nothing moves, got {scenery.scene}"
             )
-        for number, seed in enumerate(scenery.given):
-            add_fields(spec, scenery.solids(seed), f"{number}")
 
     def _lay(self, ids: np.ndarray) -> None:
         """Give geoms the layouts of some worlds."""
@@ -145,9 +142,7 @@ class MujocoWorld(World):
         most = self.scenery.most
         for world in ids[(self._laid[ids] != seeds[ids]) & (seeds[ids] >= 0)].tolist():
             solids = self.scenery.solids(int(seeds[world]))
-            layout = f"{self.scenery.numbers[world]}"
-            fields = fields_of(self._batch.model, solids, layout, most)
-            for field, rows in (geoms_of(solids, most) | fields).items():
+            for field, rows in geoms_of(solids, most).items():
                 self._batch.expand(field)[world, self._slots] = rows
             self._laid[world] = seeds[world]
         self._follow(ids)
