@@ -113,45 +113,49 @@ def _word(block: Array, step: Array, episode: Array, use: Array, low: Array, hig
 
 
 def by_numpy(
-    ranges: Array, scale: Array, inner: Array, words: Array, errors: Array, out: Array
+    ranges: Array, scale: Array, columns: int, words: Array, errors: Array, out: Array
 ) -> None:
     """Set `out`, float32, (M, N), to the readings of scans.
 
     Args:
         ranges: Along the rays, m, (M, N).
         scale: What a distance is of the way along each ray, (N,).
-        inner: Of ways to a neighbour: how many rays further on it is, and which rays have it,
-            int32, (ways, 1 + N). Without any, edges do not matter.
+        columns: Rays of each row. Those beside and below each other are neighbours.
         words: Random, uint32, (M, N).
         errors: `ErrorModel.numbers()`.
     """
     distance = ranges * scale
-    is_edge = np.zeros(distance.shape, bool)
-    for step, *rays in inner.tolist():
-        there = np.flatnonzero(rays)
-        jumps = _jumps(distance[:, there], distance[:, there + step])
-        is_edge[:, there] |= jumps
-        is_edge[:, there + step] |= jumps
+    grid = distance.reshape(len(distance), -1, columns)
+    edges = np.zeros(grid.shape, bool)
+    aside = _jumps(grid[:, :, :-1], grid[:, :, 1:])
+    edges[:, :, :-1] |= aside
+    edges[:, :, 1:] |= aside
+    below = _jumps(grid[:, :-1], grid[:, 1:])
+    edges[:, :-1] |= below
+    edges[:, 1:] |= below
     level = QUANTILES[words & np.uint32(LEVELS - 1)]
-    out[:] = _reading(distance, words, level, is_edge, errors)
+    out[:] = _reading(distance, words, level, edges.reshape(distance.shape), errors)
 
 
 def _readings(
-    ranges: Array, scale: Array, inner: Array, words: Array, errors: Array, out: Array
+    ranges: Array, scale: Array, columns: int, words: Array, errors: Array, out: Array
 ) -> None:
     """As `by_numpy`."""
     distance = np.empty(scale.size, np.float32)
     jump = np.empty(scale.size, np.int32)
     edge = np.zeros(scale.size, np.int32)
+    ways = 2 if errors[6] > errors[5] else 0  # else edges do not matter
     for m in range(out.shape[0]):
         for i in range(scale.size):
             distance[i] = ranges[m, i] * scale[i]
         edge[:] = 0
-        for k in range(inner.shape[0]):
-            step = inner[k, 0]
+        for way in range(ways):
+            step = columns if way else 1
             count = scale.size - step
             for i in range(count):
-                jump[i] = _jumps(distance[i], distance[i + step]) & inner[k, 1 + i]
+                jump[i] = _jumps(distance[i], distance[i + step])
+            if not way:  # none is beside the last ray of a row
+                jump[columns - 1 :: columns] = 0
             for i in range(count):
                 edge[i] |= jump[i]
             for i in range(count):
@@ -189,6 +193,6 @@ def compiled() -> Compiled | None:
         return None
     rows = "f4[:,::1]"
     return Compiled(
-        maker.made(f"{rows},f4[::1],i4[:,::1],u4[:,::1],f4[::1],{rows}", _readings),
+        maker.made(f"{rows},f4[::1],i8,u4[:,::1],f4[::1],{rows}", _readings),
         maker.made("u4[:,::1],u8,u4[::1],u4[::1],u4[:,::1]", _words),
     )

@@ -52,7 +52,9 @@ def checked_sensors(option: object) -> Settings:
             settings = {}
         settings = mapping(settings, f"sensors.{name}", "true, or settings by name")
         if name in SENSOR_TYPES:
-            sensors[name] = checked_settings(name, SENSOR_TYPES[name].about.settings, settings)
+            own = SENSOR_TYPES[name].about.settings
+            rules = {one: setting.limits for one, setting in own.items()}
+            sensors[name] = checked_settings(name, rules, settings)
         else:
             sensors[name] = range_sensors.checked(name, settings)
     if check("sensors.estimate", Flag(), given.get(_ESTIMATE, False)):
@@ -94,9 +96,9 @@ def readings_of(sensors: Values, vehicle: "models.Vehicle", period: float) -> li
             "shape": (len(low),),
             "low": low,
             "high": high,
-            "unit": about.units,
+            "unit": tuple(about.units),
             "frame": about.frame,
-            "components": about.components,
+            "components": tuple(about.components),
         }
         readings.append(reading)
     return [] if "observe" in sensors else readings

@@ -1,7 +1,7 @@
 """What all sensors share: settings, bounds of readings, and how they are sampled."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from statistics import NormalDist
 from typing import Any, ClassVar, NamedTuple
 
@@ -42,10 +42,10 @@ class About(NamedTuple):
     name: str
     """In the option `sensors`, and of the observation's array."""
     frame: str
-    components: tuple[str, ...]
-    units: tuple[str, ...]
+    components: Sequence[str]
+    units: Sequence[str]
     settings: Mapping[str, Setting]
-    top: tuple[float, ...] = ()
+    top: Sequence[float] = ()
     """Upper bound of each component, unless `bounds` computes it."""
     normals: int = 0
     """Normal numbers that a reading takes; `draw` gets as many at a reset."""
@@ -63,15 +63,7 @@ def setting_of(row: Values) -> Setting:
 def _about(name: str, table: Values) -> About:
     own = table.get("settings", {})
     settings = {one: setting_of(row) for one, row in own.items()}
-    return About(
-        name=name,
-        frame=table["frame"],
-        components=tuple(table["components"]),
-        units=tuple(table["units"]),
-        settings=settings | SAMPLING,
-        top=tuple(table.get("top", ())),
-        normals=table.get("normals", 0),
-    )
+    return About(**{**table, "name": name, "settings": settings | SAMPLING})
 
 
 _TABLES = read_own_toml(__file__, "sensors")
@@ -93,7 +85,8 @@ class Source(Kept):
     @classmethod
     def bounds(cls, values: Values) -> Bounds:
         """Bounds of a reading with these settings."""
-        return tuple(-bound for bound in cls.about.top), cls.about.top
+        top = tuple(cls.about.top)
+        return tuple(-bound for bound in top), top
 
 
 class Sensor(Source):
@@ -190,13 +183,13 @@ class Sensor(Source):
         return clip(self.measure(normal[..., :-1]), self._low, self._high)
 
 
-def checked_settings(sensor: str, settings: Mapping[str, Setting], given: Values) -> Values:
+def checked_settings(sensor: str, rules: Mapping[str, Rule], given: Values) -> Values:
     """Settings of a sensor by name as plain values. Raises `InputError`."""
     where = f"sensors.{sensor}"
-    check_names(given, settings, where)
+    check_names(given, rules, where)
     values = {}
     for name, value in given.items():
-        number = check(f"{where}.{name}", settings[name].limits, value)
+        number = check(f"{where}.{name}", rules[name], value)
         values[name] = list(number) if isinstance(number, tuple) else number
     return values
 

@@ -4,7 +4,6 @@ They see the solids of a layout. `models/range_sensors.toml` has their models.
 """
 
 import math
-from functools import cached_property
 from typing import Any
 from zlib import crc32
 
@@ -19,7 +18,7 @@ from ...scenes.returns import RANGES, ErrorModel, Reading
 from ..random import words_of
 from ..rotations import to_world
 from ..state import Array, ByName, clip
-from .base import Setting, Values, checked_settings, sampling
+from .base import Values, checked_settings, sampling
 from .instruments import Instrument, Moment
 
 _BEYOND = 1.001  # of its reach: rays end where nothing returns
@@ -31,10 +30,8 @@ def checked(kind: str, given: Values) -> Values:
     """Settings of a sensor as plain values. Raises `InputError`."""
     models = Choice(tuple(RANGE_MODELS[kind]))
     model = check(f"sensors.{kind}.model", models, given.get("model", models.words[0]))
-    settings = {"model": Setting(None, models)}
-    for name, limits in of_group(f"sensors.{kind}.{model}", COEFFICIENTS).items():
-        settings[name] = Setting(None, limits)
-    return checked_settings(kind, settings, given)
+    rules = of_group(f"sensors.{kind}.{model}", COEFFICIENTS)
+    return checked_settings(kind, {"model": models, **rules}, given)
 
 
 def mounted(sensors: Values, vehicle: Vehicle) -> Values:
@@ -169,7 +166,7 @@ class RangeSensor(Instrument):
         read = np.empty_like(flat)
         code = returns.compiled()
         run = code.readings if code else returns.by_numpy
-        run(flat, self._scale, self._neighbours, words, self.errors.numbers(), read)
+        run(flat, self._scale, self.shape[1], words, self.errors.numbers(), read)
         out[chosen] = read.reshape(out[chosen].shape)
         return out
 
@@ -189,17 +186,6 @@ class RangeSensor(Instrument):
         else:
             words[:] = words_of(keys, self._use, moment.episode, steps, drones * size)
         return np.ascontiguousarray(words.reshape(rows, size)[due.ravel(), : shape[1]])
-
-    @cached_property
-    def _neighbours(self) -> Array:
-        """As `returns.by_numpy` has them: to the right and below."""
-        rows, columns = self.shape
-        if not self.errors.edge_dropout:
-            return np.zeros((0, 1 + rows * columns), np.int32)
-        has = np.ones((2, rows, columns), np.int32)
-        has[0, :, -1] = has[1, -1] = 0
-        steps = np.array([[1], [columns]], np.int32)
-        return np.concatenate((steps, has.reshape(2, -1)), axis=1)
 
 
 def _others(position: Array) -> Array:
