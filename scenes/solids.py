@@ -27,7 +27,6 @@ Array = NDArray[np.float64]
 
 MAX_CELLS = 1 << 26
 """Most cells of a grid, which takes 0.5 GB then."""
-_SIZE = Limits(1e-4, 1e4, "m")
 _ENDLESS = 1e6  # m: half the width of a plane
 _SHEET = 5e-4  # m: half the thickness of a plane of a size, which lies below its face
 _MARK = 10.0  # m: half the width of level ground; what is smaller is a mark on it
@@ -156,9 +155,8 @@ class Solids:
     def of_model(cls, model: MjModel, which: ArrayLike | None = None) -> Self:
         """Geoms of a model that stand still: those of `which`, bool, or those that can touch.
 
-        An ellipsoid is the capsule about it, or the box about a flat one. Level ground, a plane
-        that can touch, and one without a size have no end; another is a sheet. Raises `InputError`
-        for meshes.
+        Level ground, a plane that can touch, and one without a size have no end; another is a
+        sheet. Raises `InputError` for meshes and ellipsoids.
         """
         if which is None:
             which = (model.geom_contype | model.geom_conaffinity) != 0
@@ -427,18 +425,9 @@ def obstacle_of(model: MjModel, data: MjData, geom: int) -> Obstacle:
         number = model.geom_dataid[geom]
         size = model.hfield_size[number, [0, 1, 3]]
         heights = _heights(model, number, name)
-    elif type_ == mjtGeom.mjGEOM_ELLIPSOID:
-        order = np.argsort(size)
-        axes = axes[:, order]
-        axes[:, 0] *= np.linalg.det(axes).round()  # right-handed again
-        thin, wide, long = size = size[order]
-        kind = "box"
-        if thin >= wide / 2:
-            kind = "capsule" if long - wide >= _SIZE.low else "sphere"
-            size = (wide, long - wide)
     elif kind not in kernels.KINDS:
         expected = ", ".join(kernels.KINDS)
-        raise InputError(f"scene: expected {expected} or ellipsoid, got {name}, a {kind}")
+        raise InputError(f"scene: expected {expected}, got the {kind} {name}")
     quaternion = np.empty(4)
     mujoco.mju_mat2Quat(quaternion, axes.ravel())
     try:

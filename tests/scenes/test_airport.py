@@ -67,8 +67,7 @@ def test_it_has_geoms_alone_and_not_too_many(airport: np.ndarray) -> None:
     assert len(airport) == len(spec.geoms)  # all of them in the world body, which is static
     assert {geom.mass for geom in spec.geoms} == {0.0}
     assert 250 < len(airport) <= 400  # drawn in software too
-    is_round = mujoco.mjtGeom.mjGEOM_ELLIPSOID  # what is solid is the capsule about it
-    assert is_round not in [geom.type for geom in spec.geoms]
+    assert mujoco.mjtGeom.mjGEOM_ELLIPSOID not in [geom.type for geom in spec.geoms]
 
 
 def corners(model: mujoco.MjModel, geom: int) -> np.ndarray:

@@ -298,8 +298,8 @@ def test_a_file_that_includes_itself_is_refused(tmp_path: Path, tag: str) -> Non
         Solids.of_scene(str(file))
 
 
-def test_a_round_ellipsoid_is_a_sphere(tmp_path: Path) -> None:
+def test_an_ellipsoid_is_refused(tmp_path: Path) -> None:
     content = "<mujoco><worldbody><geom type='ellipsoid' size='1 1 1' pos='0 0 9'/></worldbody>"
     scene = written(tmp_path, content + "</mujoco>", "ball.xml")
-    solids = Solids.of_scene(scene).standing()
-    assert solids.distance([(4.0, 0.0, 9.0), (0.0, 0.0, 13.0)]) == pytest.approx([3.0, 3.0])
+    with pytest.raises(InputError, match=r"ball.xml: .*expected sphere, .*, got the ellipsoid"):
+        Solids.of_scene(scene)

@@ -39,9 +39,6 @@ def solids(kind: str, size: tuple[float, ...], **more: object) -> Solids:
         ("plane", (), (7.0, 8.0, 2.0), 2.0),
         ("plane", (), (7.0, 8.0, -2.0), -2.0),
         ("plane", (20.0, 11.0, 1.0), (400.0, 0.0, 2.0), 2.0),  # level ground has no end
-        ("ellipsoid", (0.5, 0.4, 1.5), (0.0, 0.0, 3.5), 2.0),
-        ("ellipsoid", (0.3, 1.5, 0.5), (0.0, 3.5, 0.0), 2.0),
-        ("ellipsoid", (1.8, 7.6, 0.2), (0.0, 0.0, 1.2), 1.0),  # flat
         ("box", (1.0, 1.0, 5e-4), (0.0, 0.0, 1.0), 0.9995),
     ],
 )
@@ -171,8 +168,10 @@ def test_what_is_refused() -> None:
         scene.field((0, 0, 0), (1, 1, 1), 0.001)
     with pytest.raises(InputError, match=r"^low, high: expected two corners, each below the other"):
         scene.field((0, 0, 2), (1, 1, 1), 0.1)
-    with pytest.raises(InputError, match=r"^scene: expected .* or ellipsoid, got it, a mesh"):
+    with pytest.raises(InputError, match=r"^scene: expected sphere, .*, hfield, got the mesh it$"):
         _mesh()
+    with pytest.raises(InputError, match=r"^scene: expected sphere, .*, got the ellipsoid it$"):
+        solids("ellipsoid", (0.5, 0.4, 1.5))
     with pytest.raises(
         InputError, match=r"^scene: it: obstacle: size: expected .* m, got \(20000\.0, 1\.0"
     ):
