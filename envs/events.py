@@ -110,7 +110,5 @@ def check_events(config: "EnvConfig") -> None:
         sensor = event.get("sensor")
         if sensor and sensor not in config.sensors:
             raise InputError(f"{where}: expected a sensor of the env, got {sensor}, which is off")
-        if event["kind"] == BALL and config.scene.is_file:
-            raise InputError(f"{where}: expected a scene of a name, got {config.scene}")
         if event["kind"] == "goal" and "goal" not in config.task:
             raise InputError(f"{where}: expected a task with the option goal, got {config.env_id}")

@@ -77,12 +77,15 @@ class Solids:
     @classmethod
     def of_drafts(cls, drafts: Sequence[Draft]) -> "list[Solids]":
         """The same of several layouts of a scene, quicker than one by one."""
+        scene = drafts[0].scene
+        if not scene.is_seeded:
+            return [_of_scene(scene).standing()] * len(drafts)
         whole = cls.drawn(drafts)
         owner = np.repeat(np.arange(len(drafts)), [draft.count for draft in drafts])
         ends = np.bincount(owner[whole.stands], minlength=len(drafts)).cumsum().tolist()
         kept = whole.standing()
         layouts = [kept[first:end] for first, end in zip([0, *ends], ends, strict=False)]
-        if drafts[0].scene.name == "warehouse":
+        if scene.name == "warehouse":
             return [_hall().standing() + layout for layout in layouts]
         return layouts
 

@@ -11,6 +11,7 @@ from rotorgram.envs.compiled import CompiledLoop
 from rotorgram.envs.config import EnvConfig
 from rotorgram.envs.loop import Loop
 from rotorgram.models.errors import InputError
+from rotorgram.scenes import Solids
 
 BACKENDS = ("mujoco", "rigid")
 PERIOD = 0.02  # s
@@ -471,15 +472,17 @@ def test_a_ball_that_hits_is_a_contact(backend: str) -> None:
     loop.close()
 
 
-def test_no_ball_in_a_scene_of_a_file(tmp_path: Path) -> None:
+@pytest.mark.parametrize("backend", BACKENDS)
+@pytest.mark.parametrize("scene", ["file", "airport"])
+def test_a_ball_beside_what_stands_in_a_scene(scene: str, backend: str, tmp_path: Path) -> None:
     file = tmp_path / "room.toml"
-    file.write_text('[[obstacle]]\nkind = "sphere"\nsize = [1.0]\nposition = [9.0, 0.0, 1.0]\n')
-    with pytest.raises(InputError, match=r"expected a scene of a name, got .*room"):
-        Loop(
-            EnvConfig.from_keywords(
-                "rotorgram/Hover-v0", events=[BALL | {"at": 0.0}], scene=str(file)
-            )
-        )
+    file.write_text('[[obstacle]]\nkind = "sphere"\nsize = [1.0]\nposition = [9.0, 0.0, 20.0]\n')
+    chosen = str(file) if scene == "file" else scene
+    beside = BALL | {"at": 0.0, "start": (-60.0, 0.0, 20.0), "velocity": (0.0, 0.0, 0.1)}
+    found = clearances(beside, backend, compiled=False, scene=chosen)
+    radius = EnvConfig.from_keywords("rotorgram/Hover-v0").load_vehicle().radius
+    expected = Solids.of_scene(chosen).standing().distance((0.0, 0.0, 20.0)) - radius
+    assert found[0] == pytest.approx(expected, abs=0.05)
 
 
 def test_the_page_has_every_kind_and_size() -> None:
