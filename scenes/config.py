@@ -138,7 +138,7 @@ class SceneConfig:
         if self.name != usual.name or not usual.options:
             return self
         for name, value in self.options.items():
-            if _rounded(value) != _rounded(usual.options.get(name)):
+            if value != usual.options.get(name):
                 task = replace(self, options=usual.options)
                 raise InputError(f"scene: expected {task}, as the task's options say, got {self}")
         return replace(self, options=usual.options)
@@ -209,13 +209,6 @@ def _text_of(value: object) -> str:
     if isinstance(value, tuple):
         return "x".join(map(_text_of, value))
     return repr(value).removesuffix(".0") if isinstance(value, float) else str(value)
-
-
-def _rounded(value: object) -> object:
-    """An option without the last digits of its numbers."""
-    if isinstance(value, tuple):
-        return tuple(map(_rounded, value))
-    return round(value, 6) if isinstance(value, float) else value
 
 
 def _value_of(text: str, rule: Rule | None) -> object:

@@ -75,6 +75,7 @@ class Draft:
         self.openings: list[tuple[float, ...]] = []
         """As the rows of `ways`."""
         self.rng = np.random.Generator(np.random.PCG64(seed))
+        self.uniform = self.rng.uniform
         self.blocks: list[Block] = []
 
     @property
@@ -89,9 +90,6 @@ class Draft:
         The center, m; x and y of the direction in which it is passed; half the width, m.
         """
         return np.array(self.openings).reshape(-1, 6)
-
-    def uniform(self, low: float, high: float) -> float:
-        return self.rng.uniform(low, high)
 
     def choose(self, name: str) -> str:
         """One of the materials of several colours."""
