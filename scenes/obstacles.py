@@ -53,10 +53,8 @@ class Obstacle:
     """Of a hull: x, y and z of each, from its position, m."""
     position: Annotated[tuple[float, ...], Limits(-1e4, 1e4, "m", count=3)] = (0.0, 0.0, 0.0)
     """Of its center; of a height field of the middle of its ground."""
-    heading: Annotated[float, Limits(-360.0, 360.0, "degrees")] = 0.0
-    """Turn about z, anticlockwise, instead of a `quaternion`."""
     quaternion: Annotated[tuple[float, ...], Direction(-1e3, 1e3, count=4)] = (1.0, 0.0, 0.0, 0.0)
-    """Attitude, w first."""
+    """Attitude, w first: `[cos, 0, 0, sin]` of half the angle turns about z, anticlockwise."""
     color: Annotated[tuple[float, ...], Limits(0.0, 1.0, count=3)] = (0.5, 0.5, 0.5)
     """Red, green and blue."""
     label: Annotated[str, _WORD] = ""
@@ -64,8 +62,6 @@ class Obstacle:
 
     def __post_init__(self) -> None:
         check_fields(self, "obstacle: ")
-        if self.heading and self.quaternion[1:] != (0.0, 0.0, 0.0):
-            raise InputError("obstacle: expected a heading or a quaternion, got both")
         count = SIZES.get(self.kind, 0)
         if len(self.size) != count:
             raise InputError(
@@ -93,9 +89,6 @@ class Obstacle:
     @property
     def attitude(self) -> tuple[float, ...]:
         """Unit quaternion."""
-        if self.heading:
-            half = math.radians(self.heading) / 2
-            return math.cos(half), 0.0, 0.0, math.sin(half)
         length = math.hypot(*self.quaternion)
         return tuple(one / length for one in self.quaternion)
 
