@@ -42,16 +42,15 @@ LEAST_MASS = 0.1  # share of a mass that is left under any load
 WHOLE = ("action_delay", "observation_delay")
 """Parameters that are whole numbers; a uniform draw gives each the same chance."""
 CHANGE = Parameter(-math.inf, math.inf, "1", "what only changes within an episode; 0 before")
-_FORMS = "uniform(low,high), loguniform(low,high), normal(mean,deviation)"
 _TEXT = re.compile(r"\s*([a-z]+)\s*\(([^()]*)\)\s*")
 
 
 class Randomization:
     """Distributions by the parameter's name, as texts: "uniform(0.8, 1.2)", or a number.
 
-    `uniform(low, high)`, `loguniform(low, high)` and `normal(mean, deviation)`; a number stands for
-    itself. Raises `InputError` for anything else, and for a parameter whose effect is off. Effects
-    None: this is not checked.
+    `uniform(low, high)` and `loguniform(low, high)`; a number stands for itself. Raises
+    `InputError` for anything else, and for a parameter whose effect is off. Effects None: this is
+    not checked.
 
     `changing`: by how much parameters grow at most within an episode. Those that are not drawn
     begin at the vehicle's own value; they move no random number of the others.
@@ -95,25 +94,21 @@ class Randomization:
 
     def most_steps(self, name: str) -> int:
         """Longest delay that can be, control steps; 0 where none is."""
-        kind, numbers = self._kinds.get(name, ("", (0.0,)))
-        drawn = PARAMETERS[name].high if kind == "normal" else max(numbers)
-        return round(drawn + self._changing.get(name, 0.0))
+        _, (_, most) = self._kinds.get(name, ("", (0.0, 0.0)))
+        return round(most + self._changing.get(name, 0.0))
 
     def draw(self, draw: Draw) -> ByName:
         """Values by name, shape (W, A)."""
         drawn = {}
         for name in self.names:
-            limits = PARAMETERS.get(name, CHANGE)
-            own = 0.0 if limits.unit else 1.0
-            kind, numbers = self._kinds.get(name, ("uniform", (own, own)))
-            if kind == "normal":
-                values = numbers[0] + draw.normal(numbers[1])
-            elif kind == "loguniform":
-                values = exp(draw.uniform(log(numbers[0]), log(numbers[1])))
+            own = 0.0 if PARAMETERS.get(name, CHANGE).unit else 1.0
+            kind, (low, high) = self._kinds.get(name, ("uniform", (own, own)))
+            if kind == "loguniform":
+                values = exp(draw.uniform(log(low), log(high)))
             else:
                 spare = 0.5 if name in WHOLE else 0.0  # what is rounded to the ends
-                values = clip(draw.uniform(numbers[0] - spare, numbers[1] + spare), *numbers)
-            values = clip(values, limits.low, limits.high)
+                values = draw.uniform(low - spare, high + spare)
+            values = clip(values, low, high)
             drawn[name] = np.rint(values) if name in WHOLE else values
         return drawn
 
@@ -133,8 +128,8 @@ def _distribution(name: str, text: object) -> tuple[str, tuple[float, ...]]:
     if not _is_right(kind, numbers, limits):
         within = f"numbers from {limits.low:g} to {limits.high:g} {limits.unit}".rstrip()
         raise InputError(
-            f"randomize: {name}: expected {_FORMS} or a number, with low <= high and {within}, "
-            f"got {shortened(text)}"
+            f"randomize: {name}: expected uniform(low,high), loguniform(low,high) or a number, "
+            f"with low <= high and {within}, got {shortened(text)}"
         )
     return kind, numbers
 
@@ -142,9 +137,6 @@ def _distribution(name: str, text: object) -> tuple[str, tuple[float, ...]]:
 def _is_right(kind: str, numbers: tuple[float, ...], limits: Parameter) -> bool:
     if len(numbers) != 2:
         return False
-    first, second = numbers
-    within = [limits.low <= number <= limits.high for number in numbers]
-    if kind == "normal":
-        return within[0] and 0 <= second < math.inf
-    is_ordered = all(within) and first <= second
-    return is_ordered and (kind == "uniform" or (kind == "loguniform" and first > 0))
+    low, high = numbers
+    is_ordered = limits.low <= low <= high <= limits.high
+    return is_ordered and (kind == "uniform" or (kind == "loguniform" and low > 0))

@@ -902,13 +902,13 @@ def test_a_rotor_that_the_vehicle_lacks_is_refused() -> None:
 def test_distributions_are_told_in_one_way_of_writing() -> None:
     texts = {
         "mass": " uniform(.8,1.20)", "inertia": np.float32(1.5), "center_x": np.int64(0),
-        "thrust": "normal(1,5e-2)", "center_z": "uniform( 0,0.125 )", "reaction": "1.25",
+        "thrust": "loguniform(1,5e-0)", "center_z": "uniform( 0,0.125 )", "reaction": "1.25",
     }  # fmt: skip
     told = Randomization(texts, None).to_options()
     found = json.loads(json.dumps(told))
     assert found == {
         "mass": "uniform(0.8, 1.2)", "inertia": 1.5, "center_x": 0.0,
-        "thrust": "normal(1, 0.05)", "center_z": "uniform(0, 0.125)", "reaction": 1.25,
+        "thrust": "loguniform(1, 5)", "center_z": "uniform(0, 0.125)", "reaction": 1.25,
     }  # fmt: skip
     assert Randomization(told, None).to_options() == told
 
@@ -947,23 +947,9 @@ def test_distributions() -> None:
     mean = 1.5 / log(4)
     deviation = sqrt(3.75 / (2 * log(4)) - mean**2)
     check_distribution(" loguniform ( 0.5,2 ) ", mean, deviation, 0.5, 2.0)
-    check_distribution("normal(1, 0.1)", 1.0, 0.1, 0.1, 10.0)
-    check_distribution("normal(1, 1e5)", 5.05, 4.95, 0.1, 10.0)  # half at either bound
     check_distribution("1.2", 1.2)
     check_distribution(2, 2.0)
     check_distribution(np.float64(0.7), 0.7)
-
-
-def test_a_single_drone_draws_beyond_its_bounds() -> None:
-    world = world_of(randomize={"mass": "normal(1, 1e3)"})
-    world.random.seed(EVERY, [0])
-    seen = []
-    for _ in range(20):
-        begin(world)
-        mass = world.parameters["mass"].item()
-        assert 0.1 <= mass <= 10.0
-        seen.append(mass)
-    assert {0.1, 10.0} <= set(seen)
 
 
 def test_wrong_distributions() -> None:
