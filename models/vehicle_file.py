@@ -175,7 +175,7 @@ class VehicleFile:
     """Downward acceleration, m/s²."""
     body: Body
     rotors: RotorTable
-    """With list, thrust and reaction filled; an MJCF file's own rotors are not in it."""
+    """With the list filled; an MJCF file's own rotors are not in it."""
     cameras: tuple[Camera, ...]
 
     @property
@@ -315,7 +315,7 @@ def _rotors(numbers: _Found, given: object, model: Path | None) -> RotorTable:
         known = (*of_group("rotors", COEFFICIENTS), "source")
         check_names(table, known, "rotors of the model's file")
         return rotors
-    rotors = _with_thrust(rotors)
+    _check_thrust(rotors)
     if rotors.frame is not None and model is None:
         return _framed(rotors, rotors.frame)
     if rotors.frame is not None or not placed:
@@ -328,30 +328,15 @@ def _rotors(numbers: _Found, given: object, model: Path | None) -> RotorTable:
     return rotors
 
 
-def _with_thrust(rotors: RotorTable) -> RotorTable:
-    """Thrust and reaction, which are given once each: as they are, or by coefficients."""
-    for one, other in (("thrust", "speed"), ("reaction", "torque_coefficient")):
-        given = [key for key in (one, other) if getattr(rotors, key) is not None]
-        if len(given) != 1:
-            raise InputError(
-                f"rotors: expected {one}, or {other} with thrust_coefficient, "
-                f"got {' and '.join(given) or 'neither'}"
-            )
-        if given == [other] and rotors.thrust_coefficient is None:
-            raise InputError(f"rotors: expected thrust_coefficient with {other}, got none")
-    coefficient = rotors.thrust_coefficient
-    derived: dict[str, Any] = {}
-    if rotors.speed is not None:
-        derived["thrust"] = tuple(coefficient * speed**2 for speed in rotors.speed)
-    if rotors.torque_coefficient is not None:
-        derived["reaction"] = rotors.torque_coefficient / coefficient
-    rotors = replace(rotors, **derived)
+def _check_thrust(rotors: RotorTable) -> None:
+    for name in ("thrust", "reaction"):
+        if getattr(rotors, name) is None:
+            raise InputError(f"rotors: expected {name}, got none")
     low, high = rotors.thrust
     if not low < high:
         raise InputError(
             f"rotors: expected a lower and a higher thrust, got {low:g} and {high:g} N"
         )
-    return rotors
 
 
 def _rotor(

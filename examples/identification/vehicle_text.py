@@ -11,7 +11,7 @@ from prediction import Numbers, entry_of, inertia_of
 from rotorgram.models.vehicle import Vehicle
 from rotorgram.models.vehicle_file import read_vehicle_file
 
-_OF_FILE = ("body.size", "body.ground_clearance", "rotors.speed")
+_OF_FILE = ("body.size", "body.ground_clearance")
 """Entries of a file that the vehicle itself no longer has."""
 
 
@@ -34,8 +34,6 @@ def vehicle_toml(vehicle: Vehicle, numbers: Numbers, origins: Mapping[str, Origi
     own = vehicle.path.parent.name if vehicle.path.stem == "vehicle" else vehicle.path.stem
     values = _values(vehicle, numbers)
     values |= {name: given[name].value for name in _OF_FILE if name in given}
-    if "rotors.speed" in values:  # the file has it in place of the thrust
-        del values["rotors.thrust"]
     lines = [
         f"name = {_written(vehicle.name)}",
         f"timestep = {vehicle.timestep!r}",

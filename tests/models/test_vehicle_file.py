@@ -123,15 +123,6 @@ def test_a_list_of_tilted_rotors_above_the_origin(tmp_path: Path) -> None:
     assert vehicle.allocation[:, 0] == pytest.approx((up, roll, pitch, yaw))
 
 
-def test_thrust_and_reaction_from_speeds_and_coefficients(tmp_path: Path) -> None:
-    told = "speed = [100, 1000]\nthrust_coefficient = 8e-6\ntorque_coefficient = 1.2e-7"
-    vehicle = load(tmp_path, CRAFT.replace("thrust = [0, 8]\nreaction = 0.016", told))
-    assert vehicle.thrust_low == pytest.approx([0.08] * 4)
-    assert vehicle.thrust_high == pytest.approx([8.0] * 4)
-    assert vehicle.allocation[3] == pytest.approx([0.015, -0.015, 0.015, -0.015])
-    assert vehicle.coefficients["rotors.thrust_coefficient"] == 8e-6
-
-
 # ---- bodies
 
 
