@@ -9,7 +9,7 @@ Frames: world, z up, and the body's. Position and velocity are those of the body
 """
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -225,14 +225,6 @@ def motion(state: Array) -> Motion:
     """The motion of a state, 13 vectors."""
     x = list(state)
     return Motion(x[:3], x[3:7], x[7:10], x[10:])
-
-
-def mapped(tree: Array, change: Callable[[Array], Array]) -> Array:
-    """Nested tuples and lists with `change` applied to every vector, in a fixed order."""
-    if isinstance(tree, tuple | list):
-        parts = [mapped(one, change) for one in tree]
-        return type(tree)(*parts) if hasattr(tree, "_fields") else tuple(parts)
-    return change(tree) if hasattr(tree, "shape") else tree
 
 
 def _euler(inertia: np.ndarray) -> tuple[Array, Array]:

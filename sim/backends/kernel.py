@@ -8,6 +8,7 @@ import numpy as np
 from ..compile import Program, read
 from ..compile.layout import Layout, Memory
 from ..compile.llvm import Region, compiled, widest
+from ..compile.program import DType
 from ..state import Array
 
 _RESULT = "result"
@@ -16,8 +17,8 @@ _RESULT = "result"
 class Kernel:
     """A function that is compiled when it is first called with arguments of such kinds.
 
-    The function gives an array (W, A, k). Its arguments are arrays (W, A, ...); any others, as a
-    number of steps, are constants of the machine code.
+    The function gives an array (W, A, k) from a number of physics steps, which is a constant of the
+    machine code, and from arrays (W, A, ...) or nested tuples of them, as of `mapped`.
     """
 
     def __init__(self, function: Callable[..., Array], shape: tuple[int, ...]) -> None:
@@ -26,29 +27,30 @@ class Kernel:
         self._shape = shape
         self._made: dict[object, tuple[Memory, Callable[..., None]]] = {}
 
-    def __call__(self, *given: Array) -> np.ndarray:
+    def __call__(self, steps: int, *given: Array) -> np.ndarray:
         """The function's result, the same bits."""
-        kinds = tuple((x.dtype, x.shape) if _is_array(x) else x for x in given)
+        arrays: list[np.ndarray] = []
+        mapped(given, arrays.append)
+        kinds = (steps, *[(values.dtype, values.shape) for values in arrays])
         if kinds not in self._made:
-            self._made[kinds] = self._compiled(given)
+            self._made[kinds] = self._compiled(steps, given)
         memory, code = self._made[kinds]
-        for number, values in enumerate(given):
-            if _is_array(values):
-                memory.put(str(number), values.reshape(-1, *values.shape[2:]))
+        for number, values in enumerate(arrays):
+            memory.put(str(number), values)
         code(memory.blocks, memory.address, None)
         return memory.get(_RESULT).reshape(*self._shape, -1)
 
-    def _compiled(self, given: tuple[Array, ...]) -> tuple[Memory, Callable[..., None]]:
+    def _compiled(self, steps: int, given: tuple[Array, ...]) -> tuple[Memory, Callable[..., None]]:
         program = Program()
-        fields = {}
-        variables = list(given)
-        for number, values in enumerate(given):
-            if _is_array(values):
-                name = str(number)
-                shape = values.shape[2:]
-                fields[name] = values.dtype, shape
-                variables[number] = read(program, name, values.dtype, (1, 1, *shape))
-        result = self._function(*variables)
+        fields: dict[str, tuple[DType, tuple[int, ...]]] = {}
+
+        def variable(values: np.ndarray) -> Array:
+            name = str(len(fields))
+            shape = values.shape[2:]
+            fields[name] = values.dtype, shape
+            return read(program, name, values.dtype, (1, 1, *shape))
+
+        result = self._function(steps, *mapped(given, variable))
         fields[_RESULT] = result.dtype, result.shape[2:]
         stores = [(_RESULT, row, value) for row, value in enumerate(result.values.ravel())]
         drones = prod(self._shape)
@@ -58,5 +60,9 @@ class Kernel:
         return Memory(layout, drones), code
 
 
-def _is_array(value: object) -> bool:
-    return isinstance(value, np.ndarray)
+def mapped(tree: Array, change: Callable[[Array], Array]) -> Array:
+    """Nested tuples and lists with `change` applied to every vector, in a fixed order."""
+    if isinstance(tree, tuple | list):
+        parts = [mapped(one, change) for one in tree]
+        return type(tree)(*parts) if hasattr(tree, "_fields") else tuple(parts)
+    return change(tree) if hasattr(tree, "shape") else tree

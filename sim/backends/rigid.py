@@ -27,9 +27,9 @@ from ..state import (
     stack,
 )
 from ..world import Call, PhysicsError, World
-from .body import RigidBody, mapped, motion
+from .body import RigidBody, Varying, motion
 from .hull import Hull
-from .kernel import Kernel
+from .kernel import Kernel, mapped
 
 _NEAR = 1e-3  # m: nearer solids are measured
 _ROUNDED = 1.001  # of a way: more than what rounding adds up to
@@ -111,9 +111,8 @@ class RigidWorld(World):
 
     def fly(self, call: Call, mask: Array | None) -> None:
         """As `World.fly`."""
-        varying: list[Array] = []
-        mapped(self._body.varying, varying.append)
-        new = self._advance(call.steps, self.motion, self.acting, self.wrench, *varying)
+        varying = self._body.varying
+        new = self._advance(call.steps, self.motion, self.acting, self.wrench, varying)
         if self.slack is not None:
             way = _ROUNDED * length(new[..., :3] - self.motion[..., :3])
             self.slack = chosen(mask, self._typed(self.slack - way), self.slack)
@@ -165,12 +164,11 @@ class RigidWorld(World):
             body.varying = mapped(body.varying, self._typed)
 
     def _advanced(
-        self, steps: int, now: Array, thrust: Array, wrench: Array, *varying: Array
+        self, steps: int, now: Array, thrust: Array, wrench: Array, varying: Varying
     ) -> Array:
         """The motion after physics steps, as of `RigidBody.fly`, of a body that varies so."""
         body = copy.copy(self._body)
-        vectors = iter(varying)
-        body.varying = mapped(body.varying, lambda _: next(vectors))
+        body.varying = varying
         later = body.fly(parts_of(now), parts_of(thrust), _parts(wrench), steps)
         return self._typed(stack(later))
 
