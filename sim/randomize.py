@@ -42,7 +42,7 @@ LEAST_MASS = 0.1  # share of a mass that is left under any load
 WHOLE = ("action_delay", "observation_delay")
 """Parameters that are whole numbers; a uniform draw gives each the same chance."""
 CHANGE = Parameter(-math.inf, math.inf, "1", "what only changes within an episode; 0 before")
-_TEXT = re.compile(r"\s*([a-z]+)\s*\(([^()]*)\)\s*")
+_TEXT = re.compile(r"\s*(uniform|loguniform)\s*\(([^()]*)\)\s*")
 
 
 class Randomization:
@@ -63,7 +63,7 @@ class Randomization:
         changing: Mapping[str, float] | None = None,
     ) -> None:
         self._changing = changing or {}
-        self._kinds: dict[str, tuple[str, tuple[float, ...]]] = {}
+        self._kinds: dict[str, tuple[str, tuple[float, float]]] = {}
         given = mapping(texts, "randomize", "a mapping from names to distributions")
         check_names(given, PARAMETERS, "randomize")
         for name, text in given.items():
@@ -117,26 +117,19 @@ FIXED = Randomization({}, None)
 """Nothing is drawn."""
 
 
-def _distribution(name: str, text: object) -> tuple[str, tuple[float, ...]]:
+def _distribution(name: str, text: object) -> tuple[str, tuple[float, float]]:
     limits = PARAMETERS[name]
     match = _TEXT.fullmatch(text) if isinstance(text, str) else None
     kind, inside = match.groups() if match else ("uniform", f"{text},{text}")
     try:
-        numbers = tuple(float(word) for word in inside.split(","))
+        low, high = map(float, inside.split(","))
     except ValueError:
-        numbers = ()
-    if not _is_right(kind, numbers, limits):
+        low = high = math.nan
+    is_within = limits.low <= low <= high <= limits.high
+    if not is_within or (kind == "loguniform" and low <= 0):
         within = f"numbers from {limits.low:g} to {limits.high:g} {limits.unit}".rstrip()
         raise InputError(
             f"randomize: {name}: expected uniform(low,high), loguniform(low,high) or a number, "
             f"with low <= high and {within}, got {shortened(text)}"
         )
-    return kind, numbers
-
-
-def _is_right(kind: str, numbers: tuple[float, ...], limits: Parameter) -> bool:
-    if len(numbers) != 2:
-        return False
-    low, high = numbers
-    is_ordered = limits.low <= low <= high <= limits.high
-    return is_ordered and (kind == "uniform" or (kind == "loguniform" and low > 0))
+    return kind, (low, high)
