@@ -153,8 +153,15 @@ def predict(vehicle: Vehicle, candidates: Sequence[Numbers], windows: Windows) -
     world.vary(
         inertia=np.repeat(inertias, share, axis=0)[:, None],
         reaction=each["rotors.reaction"] / own,
-        air=each,
     )
+    air = world.effects.air
+    air.linear = tuple(each[f"drag.linear.{axis}"] for axis in "xyz")
+    air.angular = tuple(each[f"drag.angular.{axis}"] for axis in "xyz")
+    air.moment = tuple(each[f"drag.moment.{axis}"] for axis in "xy")
+    air.slope = np.sqrt(each["rotors.thrust_coefficient"])[..., None]
+    air.drag = each["rotors.drag"][..., None]
+    air.inflow = each["rotors.inflow"][..., None]
+    air.lift = each["rotors.lift"][..., None]
     position, quaternion, velocity, rates = np.split(start, (3, 7, 10), axis=-1)
     initial = InitialState(
         position=position, quaternion=quaternion, velocity=velocity, body_rates=rates

@@ -94,14 +94,12 @@ class RigidWorld(World):
         self._show(np.tile(_LEVEL.astype(self.dtype), (*shape, 1)))
         self._advance = Kernel(self._advanced, shape) if compiled else self._advanced
 
-    def vary(self, inertia: Array, reaction: Array, air: Mapping[str, Array]) -> None:
-        """Set the numbers of every drone before the first reset; needs the effect `body_drag`.
+    def vary(self, inertia: Array, reaction: Array) -> None:
+        """Set the numbers of every drone before the first reset.
 
-        Inertia, kg·m², (W, A, 3, 3); a factor of the rotors' reactions, (W, A); and coefficients of
-        the air by their names in a vehicle's file, (W, A) each.
+        Inertia, kg·m², (W, A, 3, 3), and a factor of the rotors' reactions, (W, A).
         """
         self._vary({"reaction": reaction}, inertia)
-        self.effects.air.vary(air)
 
     def place(self, mask: Array) -> None:
         """As `World.place`."""

@@ -1,7 +1,6 @@
 """Force and torque of the air: drag of the body, drag, inflow and lift of rotors, ground effect."""
 
 import math
-from collections.abc import Mapping
 
 import numpy as np
 
@@ -43,8 +42,14 @@ class AirEffects(Kept):
     * each rotor at height z over the ground, with radius R: thrust / (1 - (R / 4z)²) in place of
       its thrust (Cheeseman and Bennett, ARC R&M 3021, 1955).
 
+    Coefficients may be set to those of each drone before the first episode.
+
     Attributes:
         acts: Whether an effect is on.
+        linear, quadratic, angular: Of the body's drag, of each axis a number or (W, A).
+        moment: The same of two axes. None of it, or of `angular`: there is none.
+        drag, inflow, lift: Of rotors, numbers or (W, A, 1).
+        slope: Square root of a rotor's thrust over its speed, a number or (W, A, 1).
     """
 
     arrays = ("_before",)
@@ -67,47 +72,34 @@ class AirEffects(Kept):
                     "vehicle: expected drag.linear or drag.quadratic in the vehicle's file, which "
                     "body_drag needs, got none"
                 )
-            self._angular, self._moment, linear, quadratic = drag
-            self._linear = linear or _NOTHING
-            self._quadratic = quadratic or _NOTHING
+            self.angular, self.moment, linear, quadratic = drag
+            self.linear = linear or _NOTHING
+            self.quadratic = quadratic or _NOTHING
             # Of a fall at its terminal velocity, sqrt(weight / quadratic), the slope of the drag.
             weight = vehicle.mass * vehicle.gravity
-            slope = max(self._linear) + 2 * math.sqrt(max(self._quadratic) * weight)
+            slope = max(self.linear) + 2 * math.sqrt(max(self.quadratic) * weight)
             _check_stiffness(vehicle, slope, "drag of the body")
             turning = vehicle.mass / _least_moment(vehicle)
-            slope = turning * max(self._angular or _NOTHING)
+            slope = turning * max(self.angular or _NOTHING)
             _check_stiffness(vehicle, slope, "drag.angular, times mass over inertia,")
         if options.rotor_drag:
             (coefficient,) = coefficients.need("rotors.thrust_coefficient", "rotor_drag")
-            self._slope = math.sqrt(coefficient)  # of the square root of a thrust over the speed
+            self.slope = math.sqrt(coefficient)  # of the square root of a thrust over the speed
             three = [coefficients[f"rotors.{name}"] for name in ("drag", "inflow", "lift")]
             if three == [None] * 3:
                 raise InputError(
                     "vehicle: expected rotors.drag, inflow or lift in the vehicle's file, which "
                     "rotor_drag needs, got none"
                 )
-            self._drag, self._inflow, self._lift = (value or 0.0 for value in three)
-            speeds = np.sqrt(np.maximum(vehicle.thrust_high, 0.0)) / self._slope
-            slope = max(self._drag, self._inflow) * float(speeds.sum())
+            self.drag, self.inflow, self.lift = (value or 0.0 for value in three)
+            speeds = np.sqrt(np.maximum(vehicle.thrust_high, 0.0)) / self.slope
+            slope = max(self.drag, self.inflow) * float(speeds.sum())
             # Of a turn: about the least moment of inertia, at the longest arm.
             arm = float(((geometry[:, :3] - vehicle.center_of_mass) ** 2).sum(axis=1).max())
             turning = vehicle.mass * arm / _least_moment(vehicle)
             _check_stiffness(vehicle, slope * max(1.0, turning), "drag of the rotors")
         if options.ground_effect:
             (self._radius,) = coefficients.need("rotors.radius", "ground_effect")
-
-    def vary(self, numbers: Mapping[str, Array]) -> None:
-        """Take other coefficients for each drone, (W, A), by their names in a vehicle's file.
-
-        Those of an axis end in its name, as drag.linear.x; for `rotor_drag` and `body_drag`.
-        """
-        self._linear = tuple(numbers[f"drag.linear.{axis}"] for axis in "xyz")
-        self._angular = tuple(numbers[f"drag.angular.{axis}"] for axis in "xyz")
-        self._moment = tuple(numbers[f"drag.moment.{axis}"] for axis in "xy")
-        self._slope = np.sqrt(numbers["rotors.thrust_coefficient"])[..., None]
-        self._drag = numbers["rotors.drag"][..., None]
-        self._inflow = numbers["rotors.inflow"][..., None]
-        self._lift = numbers["rotors.lift"][..., None]
 
     def begin(self, mask: Array, state: WorldState) -> None:
         """Begin at the motion of a state."""
@@ -156,15 +148,15 @@ class AirEffects(Kept):
         v = add(v, cross(w, self._center))
         speed = square_root(dot(v, v))
         factor = self._factors.get("body_drag", 1.0)
-        both = zip(self._linear, self._quadratic, v, strict=True)
+        both = zip(self.linear, self.quadratic, v, strict=True)
         x, y, z = (-factor * (linear + quadratic * speed) * u for linear, quadratic, u in both)
         torque = cross(self._center, (x, y, z))
-        if self._angular is not None:
-            pairs = zip(torque, self._angular, w, strict=True)
+        if self.angular is not None:
+            pairs = zip(torque, self.angular, w, strict=True)
             roll, pitch, yaw = (t - factor * k * rate for t, k, rate in pairs)
             torque = roll, pitch, yaw
-        if self._moment is not None:
-            roll, pitch = (factor * k for k in self._moment)
+        if self.moment is not None:
+            roll, pitch = (factor * k for k in self.moment)
             torque = torque[0] + roll * v[1], torque[1] - pitch * v[0], torque[2]
         return (x, y, z), torque
 
@@ -184,11 +176,11 @@ class AirEffects(Kept):
             along = dot((x, y, z), axis)
             plane = (x - along * axis[0], y - along * axis[1], z - along * axis[2])
             root = square_root(thrust) if root is None else root
-            speed = root / self._slope
+            speed = root / self.slope
             if "rotor_drag" in self._factors:
                 speed = speed * self._factors["rotor_drag"][..., None]
-            up = self._lift * dot(plane, plane) - self._inflow * speed * along
-            drag = -self._drag * speed
+            up = self.lift * dot(plane, plane) - self.inflow * speed * along
+            drag = -self.drag * speed
             push = (drag * plane[0], drag * plane[1], drag * plane[2])
         if self._options.ground_effect:
             x, y, z, origin = around[6:]
