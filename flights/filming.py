@@ -1,9 +1,8 @@
 """Films of trajectories: a frame shows the control step of its time; several side by side."""
 
 import math
-from collections.abc import Generator, Sequence
+from collections.abc import Generator, Iterator, Mapping, Sequence
 from contextlib import ExitStack, closing
-from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Annotated
@@ -15,7 +14,6 @@ from ..models import InputError
 from ..models.fields import Limits, check_fields, immutable
 from ..rendering import Camera, Canvas, Moment, Stage
 from ..rendering.film import QUALITY, Picture, write_film
-from ..rendering.gl import Lines
 from ..rendering.insets import add_insets
 from ..scenes import SceneConfig, parse_scene
 from .executors import Tell
@@ -23,6 +21,8 @@ from .trajectories import Flights, Trajectory, common_scene
 
 MAX_FRAMES = 1_000_000
 """Largest number of frames of a film: 11 hours of it."""
+Times = Mapping[int, Sequence[float]]
+"""Times of the frames of each episode that a film shows, s."""
 _SPACE = 2  # pixels between panes
 _DARK = (13, 18, 26)
 _ASPECT = 1.2  # of a pane that shows a craft well
@@ -65,11 +65,6 @@ class FilmTrack:
         """The trajectories of each episode, one of each drone."""
         firsts = range(0, len(self.trajectories), self.drones)
         return [self.trajectories[first : first + self.drones] for first in firsts]
-
-    @cached_property
-    def moments(self) -> list[list[list[Moment]]]:
-        """The moments by episode and drone."""
-        return [[moments(one) for one in world] for world in self.episodes]
 
     def note(self, episode: int, step: int) -> str:
         """Which trajectories have ended at a step otherwise than by the clock."""
@@ -128,11 +123,11 @@ def film(
     # Whatever goes wrong, the OpenGL context is given back here.
     with closing(_frames(tracks, config, times, tell)) as frames:
         write_film(path, frames, config.fps, quality=config.quality)
-    return len(times)
+    return sum(map(len, times.values()))
 
 
-def _times(tracks: Sequence[FilmTrack], config: Film, *, still: bool) -> list[tuple[int, float]]:
-    """Episode and time of flight of every frame, from its start to its end."""
+def _times(tracks: Sequence[FilmTrack], config: Film, *, still: bool) -> Times:
+    """Times of the frames of each episode, from its start to its end."""
     counts = {(len(track.episodes), track.drones) for track in tracks}
     if len(counts) != 1 or not tracks[0].episodes:
         raise InputError("tracks: expected one or more, with as many episodes and drones each")
@@ -140,9 +135,9 @@ def _times(tracks: Sequence[FilmTrack], config: Film, *, still: bool) -> list[tu
     for worlds in zip(*(track.episodes for track in tracks), strict=True):
         lengths.append(max(one.seconds for world in worlds for one in world))
     if config.at is not None:
-        return [(0, config.at)]
+        return {0: [config.at]}
     if still:
-        return [(len(lengths) - 1, lengths[-1])]
+        return {len(lengths) - 1: lengths[-1:]}
     step = config.speed / config.fps
     seconds = sum(lengths)
     if seconds / step > MAX_FRAMES:
@@ -150,10 +145,10 @@ def _times(tracks: Sequence[FilmTrack], config: Film, *, still: bool) -> list[tu
             f"film: expected at most {MAX_FRAMES:,} frames, got {seconds / step:,.0f} "
             f"for {seconds:,.0f} s of flight; choose a higher speed"
         )
-    times = []
+    times = {}
     for episode, length in enumerate(lengths):
         frames = int(length / step + 1e-6) + 1
-        times += [(episode, number * step) for number in range(frames)]
+        times[episode] = [number * step for number in range(frames)]
     return times
 
 
@@ -165,34 +160,40 @@ def grid(count: int, width: int, height: int) -> tuple[int, int]:
 
 
 def _frames(
-    tracks: Sequence[FilmTrack], config: Film, times: Sequence[tuple[int, float]], tell: Tell
+    tracks: Sequence[FilmTrack], config: Film, times: Times, tell: Tell
 ) -> Generator[Picture, None, None]:
     """Frames, shape (height, width, 3)."""
     columns, rows = grid(len(tracks), config.width, config.height)
     width = (config.width - _SPACE * (columns - 1)) // columns
     height = (config.height - _SPACE * (rows - 1)) // rows
-    drones = tracks[0].drones
-    named = len(tracks) > 1
+    total = sum(map(len, times.values()))
+    number = 0
     shown: SceneConfig | None = None
     with ExitStack() as opened:
-        for number, (episode, seconds) in enumerate(times, 1):
+        for episode, seconds in times.items():
             scene = _scene_of(tracks, config, episode)
             if scene != shown:
                 opened.close()
                 shown = scene
-                panes = []
+                canvases = []
                 for track in tracks:
-                    stage = Stage(scene, drones, vehicle=config.vehicle)
-                    canvas = opened.enter_context(Canvas(stage, width, height, fast=config.fast))
-                    panes.append(_Pane(track, canvas, config, named))
-            frame = np.full((config.height, config.width, 3), _DARK, np.uint8)
-            for place, pane in enumerate(panes):
-                row, column = divmod(place, columns)
-                x = (width + _SPACE) * column
-                y = (height + _SPACE) * row
-                frame[y : y + height, x : x + width] = pane.draw(episode, seconds)
-            yield frame
-            tell(number, len(times), "done" if number == len(times) else "frames")
+                    stage = Stage(scene, track.drones, vehicle=config.vehicle)
+                    canvas = Canvas(stage, width, height, fast=config.fast)
+                    canvases.append(opened.enter_context(canvas))
+            panes = [
+                _pane(track, canvas, config, episode, seconds, named=len(tracks) > 1)
+                for track, canvas in zip(tracks, canvases, strict=True)
+            ]
+            for pictures in zip(*panes, strict=True):
+                frame = np.full((config.height, config.width, 3), _DARK, np.uint8)
+                for place, picture in enumerate(pictures):
+                    row, column = divmod(place, columns)
+                    x = (width + _SPACE) * column
+                    y = (height + _SPACE) * row
+                    frame[y : y + height, x : x + width] = picture
+                yield frame
+                number += 1
+                tell(number, total, "done" if number == total else "frames")
 
 
 def _scene_of(tracks: Sequence[FilmTrack], config: Film, episode: int) -> SceneConfig:
@@ -202,49 +203,47 @@ def _scene_of(tracks: Sequence[FilmTrack], config: Film, episode: int) -> SceneC
     return common_scene(one.scene.shown for track in tracks for one in track.episodes[episode])
 
 
-@dataclass
-class _Pane:
-    """Pictures of one track, drawn where they change."""
+def _pane(
+    track: FilmTrack,
+    canvas: Canvas,
+    config: Film,
+    episode: int,
+    times: Sequence[float],
+    *,
+    named: bool,
+) -> Iterator[Picture]:
+    """The picture at each time of an episode of one track, drawn where it changes.
 
-    track: FilmTrack
-    canvas: Canvas
-    config: Film
-    named: bool
-    """Whether the name is written in any case."""
-    picture: Picture | None = None
-    shown: tuple[int, int] = (-1, -1)
-    """Episode and step of the picture."""
-
-    def draw(self, episode: int, seconds: float) -> Picture:
-        """The picture at a time of an episode."""
-        longest = max(self.track.episodes[episode], key=len)
+    Its name is on it in any case if it is `named`, otherwise beside the time.
+    """
+    flown = [moments(one) for one in track.episodes[episode]]
+    longest = max(track.episodes[episode], key=len)
+    stage = canvas.stage
+    shown = -1
+    for seconds in times:
         step = longest.step_at(seconds)
-        if self.picture is not None and self.shown == (episode, step):
-            return self.picture
-        flown = self.track.moments[episode]
-        stage = self.canvas.stage
-        first = self.shown[1] + 1 if episode == self.shown[0] else 0
-        for now in range(first, step + 1):  # paths have no gaps
+        for now in range(shown + 1, step + 1):  # paths have no gaps
             stage.show(*(own[min(now, len(own) - 1)] for own in flown))
-        self.shown = episode, step
-        self.picture = self.canvas.draw(self.config.camera, self._lines(episode, step))
-        add_insets(self.picture, stage.moments[0])
-        return self.picture
+        if step > shown:
+            shown = step
+            lines = [(track.name, "")] if named else []
+            if config.overlay:
+                lines = _lines(track, stage, episode, step)
+            picture = canvas.draw(config.camera, lines)
+            add_insets(picture, stage.moments[0])
+        yield picture
 
-    def _lines(self, episode: int, step: int) -> Lines:
-        """Name and time; the first metric, of several drones the least distance; early ends."""
-        track = self.track
-        if not self.config.overlay:
-            return [(track.name, "")] if self.named else []
-        seconds = step * track.trajectories[0].spec.control_period
-        lines = [(track.name, f"{seconds:.2f} s")]
-        stage = self.canvas.stage
-        distance = stage.least_distance
-        if distance is not None:
-            lines.append(("least distance", f"{distance:.2f} m"))
-        else:
-            lines += stage.moments[0].metrics[:1]
-        for reading in stage.moments[0].readings:
-            lines.append((reading.name, f"0 to {reading.reach:g} m"))
-        note = track.note(episode, step)
-        return [*lines, (note, "")] if note else lines
+
+def _lines(track: FilmTrack, stage: Stage, episode: int, step: int) -> list[tuple[str, str]]:
+    """Name and time; the first metric, of several drones the least distance; early ends."""
+    seconds = step * track.trajectories[0].spec.control_period
+    lines = [(track.name, f"{seconds:.2f} s")]
+    distance = stage.least_distance
+    if distance is not None:
+        lines.append(("least distance", f"{distance:.2f} m"))
+    else:
+        lines += stage.moments[0].metrics[:1]
+    for reading in stage.moments[0].readings:
+        lines.append((reading.name, f"0 to {reading.reach:g} m"))
+    note = track.note(episode, step)
+    return [*lines, (note, "")] if note else lines
