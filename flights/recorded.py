@@ -3,7 +3,6 @@
 import logging
 from collections.abc import Collection, Iterator, Sequence
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 
@@ -96,16 +95,6 @@ def read_episodes(
         yield from reader.finish()
 
 
-class _Flight(NamedTuple):
-    """An episode of one drone, as far as it is read."""
-
-    seed: int | None
-    arrays: list[list[Array]]
-    """Of each row the telemetry, then the observations that are wanted."""
-    rewards: list[float]
-    actions: list[Array]
-
-
 class _SessionReader:
     """Makes trajectories from the States and Commands of one session."""
 
@@ -120,7 +109,9 @@ class _SessionReader:
         }
         count = session.num_envs
         self._chosen = np.ones(count, bool) if drone is None else np.arange(count) == drone
-        self._flights: dict[int, _Flight] = {}
+        # Of the running episodes.
+        self._rows: dict[int, list[list[Array]]] = {}
+        self._seeds: dict[int, int | None] = {}
         self._episodes = [0] * count
 
     def take(self, state: State, command: Command | None) -> Iterator[Trajectory]:
@@ -131,12 +122,9 @@ class _SessionReader:
             yield from self.finish()
             return
         for drone in np.flatnonzero((command.orders == FLY) & self._chosen).tolist():
-            if drone not in self._flights:
+            if drone not in self._rows:
                 continue  # its episode has ended
-            flight = self._flights[drone]
-            flight.arrays.append(self._arrays(state, drone))
-            flight.rewards.append(float(state.rewards[drone]))
-            flight.actions.append(np.array(command.actions[drone]))
+            self._rows[drone].append(self._row(state, command, drone))
             if state.terminated[drone]:
                 yield from self._end(drone, "terminated")
             elif state.truncated[drone]:
@@ -145,37 +133,39 @@ class _SessionReader:
             yield from self._end(drone, "cut off")
             # The first drone's seed counts for its world.
             first = drone - drone % len(self.session.spec.agents)
-            seed = None if command.seeds is None else int(command.seeds[first])
-            self._flights[drone] = _Flight(seed, [self._arrays(state, drone)], [], [])
+            self._seeds[drone] = None if command.seeds is None else int(command.seeds[first])
+            self._rows[drone] = [self._row(state, command, drone)]
 
     def finish(self) -> Iterator[Trajectory]:
         """The episodes that the journal's end cuts off."""
-        for drone in sorted(self._flights):
+        for drone in sorted(self._rows):
             yield from self._end(drone, "cut off")
 
-    def _arrays(self, state: State, drone: int) -> list[Array]:
-        wanted = [*state.telemetry]
-        wanted += [state.observations[place] for place in self._observed.values()]
-        return [np.array(values[drone]) for values in wanted]
+    def _row(self, state: State, command: Command, drone: int) -> list[Array]:
+        """Telemetry, observations that are wanted, and the reward and action that led there."""
+        observed = [state.observations[place] for place in self._observed.values()]
+        columns = [*state.telemetry, *observed, state.rewards, command.actions]
+        return [np.array(column[drone]) for column in columns]
 
     def _end(self, drone: int, ending: Ending) -> Iterator[Trajectory]:
         """The episode of a drone, if it has a step."""
-        flight = self._flights.pop(drone, None)
-        if flight is None or not flight.actions:
+        rows = self._rows.pop(drone, [])
+        if len(rows) < 2:
             return
         spec = self.session.spec
-        columns = iter([np.stack(column) for column in zip(*flight.arrays, strict=True)])
-        telemetry = {array.name: next(columns) for array in spec.telemetry}
+        *columns, rewards, actions = map(np.stack, zip(*rows, strict=True))
+        count = len(spec.telemetry)
+        names = [array.name for array in spec.telemetry]
         yield Trajectory(
             spec=spec,
-            telemetry=telemetry,
-            rewards=np.array(flight.rewards),
-            actions=np.stack(flight.actions),
+            telemetry=dict(zip(names, columns[:count], strict=True)),
+            rewards=rewards[1:],
+            actions=actions[1:],
             ending=ending,
             episode=self._episodes[drone],
-            observations=dict(zip(self._observed, columns, strict=True)),
+            observations=dict(zip(self._observed, columns[count:], strict=True)),
             session=self.session.index,
             drone=drone,
-            seed=flight.seed,
+            seed=self._seeds[drone],
         )
         self._episodes[drone] += 1
