@@ -25,11 +25,6 @@ Columns = dict[str, Column]
 
 FORMATS = (".png", ".pdf", ".svg")
 _COLUMNS = 3
-_FIRST = (
-    "position", "velocity", "attitude", "body_rates", "rates", "wind", "thrust", "battery",
-    "voltage",
-)  # fmt: skip
-"""Order of the telemetry; other arrays follow."""
 _ON_POSITION = {"goal": "--", "payload": ":"}
 """Arrays that are drawn beside the position, and their line style."""
 _HIDDEN = ("time", "drawn")
@@ -56,14 +51,12 @@ def plot_flights(flights: Mapping[str, Trajectory], out: Path, *, plan: bool = F
 
 
 def shown_columns(flight: Trajectory) -> Columns:
-    """The telemetry of a flight by name, in the order of its panels; attitude as angles."""
-    arrays = {array.name: array for array in flight.spec.telemetry}
-    names = [name for name in _FIRST if name in arrays]
-    names += [name for name in arrays if name not in (*_FIRST, *_HIDDEN)]
+    """The numbers of a flight's telemetry by name, in its order; attitude as angles."""
     columns: Columns = {}
-    for name in names:
-        array = arrays[name]
-        values = flight.telemetry[name]
+    for array in flight.spec.telemetry:
+        if array.name in _HIDDEN:
+            continue
+        values = flight.telemetry[array.name]
         if array.components == QUATERNION:
             array = _ANGLES
             values = np.degrees(roll_pitch_yaw(values))
