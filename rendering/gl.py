@@ -26,11 +26,8 @@ _HIDDEN = "ROTORGRAM_GL"
 environment variable, so that the processes that this one starts know it too."""
 
 
-_state = {"used": False, "forked": False}
-"""Whether this process has opened OpenGL, and whether it was forked from one that had: there
-OpenGL would wait for threads that do not exist."""
-if hasattr(os, "register_at_fork"):
-    os.register_at_fork(after_in_child=lambda: _state.update(forked=_state["used"]))
+_opened: set[int] = set()
+"""Ids of the processes that have opened OpenGL: this one, and those that it was forked from."""
 
 
 @contextmanager
@@ -57,7 +54,7 @@ def offscreen_context(width: int, height: int) -> Any:
     system's own elsewhere.
     """
     _refuse_forked()
-    _state["used"] = True
+    _opened.add(os.getpid())
     name = _library()
     reason = "MUJOCO_GL switches it off"
     if name != "disable":
@@ -76,8 +73,13 @@ def offscreen_context(width: int, height: int) -> Any:
     )
 
 
+def _is_forked() -> bool:
+    """Whether from a process that draws: here OpenGL would wait for threads that do not exist."""
+    return not _opened <= {os.getpid()}
+
+
 def _refuse_forked() -> None:
-    if _state["forked"]:
+    if _is_forked():
         raise NoOpenGL(
             "OpenGL: expected a process that was started anew, got one that was forked from one "
             "that draws; multiprocessing's start method 'spawn' starts it anew"
@@ -169,7 +171,7 @@ def _free(gl: Any, context: "mujoco.MjrContext") -> None:
     MuJoCo's context frees objects by their numbers, in whatever OpenGL is current. Where Python
     collects garbage, that may be another one.
     """
-    if _state["forked"]:  # it is the other process's
+    if _is_forked():  # it is the other process's
         return
     with gl.as_current():
         context.free()

@@ -6,7 +6,6 @@ Imports neither torch nor pandas.
 import json
 from collections.abc import Mapping
 from dataclasses import asdict, field, replace
-from hashlib import blake2b
 from pathlib import Path
 from typing import Any, Literal
 
@@ -224,11 +223,9 @@ def file_words(text: str) -> str:
 
 
 def _word(value: object) -> str:
-    """A value for a name: without quotes, and of a long one, as a track, its digest."""
+    """A value for a name: without quotes, and of a long one, as a track, its beginning."""
     text = value if isinstance(value, str) else json.dumps(value)
-    if len(text) > _LONGEST_WORD:
-        return blake2b(text.encode(), digest_size=4).hexdigest()
-    return text.replace('"', "")
+    return text.replace('"', "")[:_LONGEST_WORD]
 
 
 Kind = Literal["paper", "compare", "sweep", "benchmark"]
