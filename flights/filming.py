@@ -68,8 +68,8 @@ class FilmTrack:
 
     def note(self, episode: int, step: int) -> str:
         """Which trajectories have ended at a step otherwise than by the clock."""
-        ended = [one for one in self.episodes[episode] if step >= len(one)]
-        early = [one.ending for one in ended if one.ending != "truncated"]
+        flown = self.episodes[episode]
+        early = [one.ending for one in flown if step >= len(one) and one.ending != "truncated"]
         if self.drones == 1:
             return "".join(early)
         return f"{len(early)} of {self.drones} ended" if early else ""

@@ -30,8 +30,7 @@ def write_report(results: Results) -> pd.DataFrame:
     folder = results.folder
     table = results_table(results)
     table.to_csv(folder / "results.csv")
-    if len(results.runs):
-        results.runs.to_csv(folder / "runs.csv", index=False)
+    results.runs.to_csv(folder / "runs.csv", index=False)
     text = (
         _head(results)
         + markdown(results, table)
