@@ -75,7 +75,7 @@ class CompiledLoop(Loop):
             record.action = self.pipeline.actions.neutral()
         record.waiting = results["waiting"].reshape(record.shape)
         self._give(results)
-        self._take_told(told)
+        self._told = told
         if some(results["wrong"]):
             self._check()
         self._measure()

@@ -92,8 +92,7 @@ class Loop:
         self.quantities = quantities_of(task)
         self._throws = [event["kind"] == BALL for event in flown.events]
         self._closed = False
-        self._told: Told | None = None
-        self._content: Content | None = None
+        self._told: Told | None = None  # what record, world and task say when asked
         self.observations: ByName
         self._take()
 
@@ -302,7 +301,7 @@ class Loop:
         """New arrays of N drones, of the declared dtypes."""
         record = self._record
         count = self.num_envs
-        self._take_told(None)
+        self._told = None
         self._headline: Floats | None = None
         known = vars(record).get("observations", {})
         self.observations = {}
@@ -359,9 +358,7 @@ class Loop:
     @property
     def telemetry(self) -> Mapping[str, Floats]:
         """By the names of `spec.telemetry`, float64, shape (N, *shape)."""
-        if self._content is None:
-            self._content = self.told()()
-        return self._content[0]
+        return self.told()()[0]
 
     def told(self) -> Told:
         """Telemetry and terms of the reward as they are now, for later."""
@@ -377,11 +374,6 @@ class Loop:
         if not record.has_begun:
             raise gym.error.ResetNeeded("telemetry: expected a call of reset() first")
         return record
-
-    def _take_told(self, told: Told | None) -> None:
-        """Take what is told of a step; None: what record, world and task say when asked."""
-        self._told = told
-        self._content = None
 
     def close(self) -> None:
         """Release threads and memory; what the last step gave can be read on."""
