@@ -78,16 +78,11 @@ class Pipeline:
 
         self.stages = [Starts(task, world), *flying, *events, *observing]
         self.fly = [*[stage.act for stage in events], *[stage.step for stage in flying]]
-        self.begin = [stage.begin for stage in self.stages]
         self.observe = [stage.step for stage in (*observing, *events)]
         self.before = [*self.fly[:-1], flight.control]
-        self.set_out = []
-        self.sense = []
-        for stage in self.stages:
-            if isinstance(stage, Sensing):
-                self.sense.append(stage.begin)
-            else:
-                self.set_out.append(flight.set_out if stage is flight else stage.begin)
+        self.set_out = [one.begin for one in self.stages if not isinstance(one, Sensing)]
+        self.sense = [one.begin for one in self.stages if isinstance(one, Sensing)]
+        self.begin = [*self.set_out, flight.place, *self.sense]
 
     def _observing(self, task: Task, world: World, sensors: Sensors | None) -> list[Stage]:
         """From the measurement to the observation of the present."""

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ...models.errors import InputError
-from ...sim.state import Array, found
+from ...sim.state import found
 from .record import Floats, Mask, Record, Stage
 
 
@@ -25,10 +25,7 @@ class Ends(Stage):
 
     def step(self, record: Record) -> None:
         """Raises `InputError` as `refuse_unfit`."""
-        total: Array = 0.0
-        for term in record.terms.values():
-            total = total + term
-        reward = total + np.zeros(record.shape)
+        reward = sum(record.terms.values(), 0.0) + np.zeros(record.shape)
         terminated = np.zeros(record.shape, bool) | record.ended
         truncated = (record.steps >= self.episode_length) > terminated
         record.unfit = _unfit(record, reward)

@@ -35,7 +35,11 @@ class Flight(Stage):
 
     def begin(self, record: Record) -> None:
         """The task has set the start."""
-        self.world.reset(record.begun, record.start)
+        self.world.begin(record.begun, record.start)
+
+    def place(self, record: Record) -> None:
+        """The physics takes the start."""
+        self.world.place(record.begun)
 
     def step(self, record: Record) -> None:
         """One control step."""
@@ -47,10 +51,6 @@ class Flight(Stage):
             self.world.fly(call, record.flown)
 
     # ---- the same in parts: all but the physics is array code
-
-    def set_out(self, record: Record) -> None:
-        """`begin` without the physics."""
-        self.world.begin(record.begun, record.start)
 
     def control(self, record: Record) -> None:
         """What the physics flies under from now on."""
