@@ -184,15 +184,18 @@ class Elevation(NumbersTask):
 
     def _numbers(self) -> list[Number]:
         """Of the observation, with their bounds."""
-        least = self.vehicle.thrust_low[0] / self._hover - 1
-        most = self.vehicle.thrust_high[0] / self._hover - 1
-        lows = np.array((-self.error_bound, -self.rate_bound, least), np.float32)
-        highs = np.array((self.error_bound, self.rate_bound, most), np.float32)
-        size = 3 if self.options.observation == "full" else 1
-        # Rounding to float32 may move a bound inwards by half a unit: step outwards once.
-        outwards = np.float32(np.inf)
-        low = np.nextafter(lows, -outwards).tolist()
-        high = np.nextafter(highs, outwards).tolist()
-        names = ("elevation error", "rate of the error", "thrust over hover")
-        rows = zip(names, ("m", "m/s", "1"), low, high, strict=True)
-        return [Number(*row) for row in rows][:size]
+        error = above(self.error_bound)
+        rate = above(self.rate_bound)
+        least = -above(1 - self.vehicle.thrust_low[0] / self._hover)
+        most = above(self.vehicle.thrust_high[0] / self._hover - 1)
+        numbers = [
+            Number("elevation error", "m", -error, error),
+            Number("rate of the error", "m/s", -rate, rate),
+            Number("thrust over hover", "1", least, most),
+        ]
+        return numbers if self.options.observation == "full" else numbers[:1]
+
+
+def above(bound: float) -> float:
+    """The next float32 above a bound, which rounding may move inwards by half a unit."""
+    return float(np.nextafter(np.float32(bound), np.float32(np.inf)))

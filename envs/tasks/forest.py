@@ -24,7 +24,6 @@ from ...sim import (
 from ..spec import ArraySpec
 from ..state import State
 from .goal import (
-    LEAST_TILT_COSINE,
     MAX_RATE,
     MAX_SPEED,
     Number,
@@ -239,7 +238,7 @@ class Forest(NumbersTask):
             | (abs(position[..., 0]) > self._half + _BEHIND)
             | (position[..., 2] > self.ceiling)
         )
-        crashed = state.touching | beside | (state.tilt_cosine < LEAST_TILT_COSINE)
+        crashed = self.crashed(state, beside)
         success = arrived > crashed
         speed = length(state.velocity)
         most = _FAST * self.control_period

@@ -125,6 +125,10 @@ class NumbersTask(Task):
         self.observation = (array,)
         self._bounds = array.bounds()
 
+    def crashed(self, state: State, outside: Array) -> Array:
+        """Whether drones are outside of their band, touch anything, or flipped over, (W, A)."""
+        return outside | state.touching | (state.tilt_cosine < LEAST_TILT_COSINE)
+
 
 class GoalTask(NumbersTask):
     """Base of tasks that are flown to a goal, with an observation of 15 + R numbers and more.
@@ -212,10 +216,6 @@ class GoalTask(NumbersTask):
     def place(self, state: State) -> Array:
         """Where each drone should be, world frame, m, shape (W, A, 3)."""
         return self.goal(state)
-
-    def crashed(self, state: State, outside: Array) -> Array:
-        """Whether drones are outside of their band, touch anything, or flipped over, (W, A)."""
-        return outside | state.touching | (state.tilt_cosine < LEAST_TILT_COSINE)
 
     def judged(
         self,

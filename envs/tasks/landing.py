@@ -161,9 +161,9 @@ class Landing(GoalTask):
         memory.side = np.where(side < 0, -1.0, 1.0) if circle else 0.0 * phase
         position = np.array((0.0, 0.0, self._height + options.start_height)) + offset
         rest = 0.0 * position
-        # Velocity and cosine of the tilt after the last step, and before contact.
-        memory.velocity = memory.arrival = rest
-        memory.upright = memory.arrival_upright = 1.0
+        # Velocity and cosine of the tilt after the last step before contact.
+        memory.arrival = rest
+        memory.upright = 1.0
         memory.potential = self._potential_of(position, rest)
         memory.progress = 0.0
         return InitialState(position=position)
@@ -173,13 +173,11 @@ class Landing(GoalTask):
         memory = self.memory
         touching = state.touching
         memory.phase = memory.phase + memory.rate * self.control_period
-        memory.arrival = np.where(touching[..., None], memory.velocity, state.velocity)
-        memory.arrival_upright = np.where(touching, memory.upright, state.tilt_cosine)
+        memory.arrival = np.where(touching[..., None], memory.arrival, state.velocity)
+        memory.upright = np.where(touching, memory.upright, state.tilt_cosine)
         potential = self._potential_of(state.position, memory.arrival)
         memory.progress = potential - memory.potential
         memory.potential = potential
-        memory.velocity = state.velocity
-        memory.upright = state.tilt_cosine
 
     def further(self, state: State) -> list[Array]:
         """The velocity of the pad."""
@@ -197,7 +195,7 @@ class Landing(GoalTask):
             & (distance <= options.pad_radius)
             & (-relative[..., 2] <= options.sink)
             & (length(relative[..., :2]) <= options.drift)
-            & (self.memory.arrival_upright >= self._least_upright)
+            & (self.memory.upright >= self._least_upright)
         )
         terminated = self.crashed(state, length(away) > options.flight_band)
         return Outcome(
