@@ -5,7 +5,6 @@ from typing import Any
 import numpy as np
 
 from ..models.errors import InputError, require
-from ..sim.snapshots import Arrays, Snapshot
 from .actions import Actions
 from .autoreset import AdvancingVectorEnv, Observation
 from .info import Info
@@ -136,17 +135,5 @@ class LocalParallelEnv(AdvancingParallelEnv):
             env_id, drones, render_mode, autoreset_mode="Disabled", drones=drones, **keywords
         )
         super().__init__(world)
-        self._local = world
         self.render_mode = render_mode
         self.metadata["render_modes"] = RENDER_MODES
-
-    def snapshot(self) -> Snapshot:
-        """Copies of all arrays that a later step depends on, by name."""
-        flying = [agent in self.agents for agent in self.possible_agents]
-        return self._local.snapshot() | {"agents": np.array(flying)}
-
-    def restore(self, snapshot: Arrays) -> None:
-        """Put back a snapshot of an env of the same config. No later bit differs."""
-        self._local.restore(snapshot)
-        flying = zip(self.possible_agents, snapshot["agents"].tolist(), strict=True)
-        self.agents = [agent for agent, flies in flying if flies]

@@ -138,15 +138,11 @@ def test_a_single_env_flies_on_rigid() -> None:
     assert [info[name] for name in "xyz"] == pytest.approx([exact[name] for name in "xyz"])
 
 
-def test_parallel_envs_are_restored_and_copied() -> None:
+def test_parallel_envs_are_copied() -> None:
     from rotorgram.envs.parallel import LocalParallelEnv
 
     env = LocalParallelEnv("rotorgram/Formation-v0", drones=3)
     env.reset(seed=1)
-    snapshot = env.snapshot()
     twin = pickle.loads(pickle.dumps(env))
     actions = {agent: env.action_space(agent).sample() for agent in env.agents}
-    first = bits(env.step(actions))
-    env.restore(snapshot)
-    assert bits(env.step(actions)) == first
-    assert bits(twin.step(actions)) == first
+    assert bits(twin.step(actions)) == bits(env.step(actions))
