@@ -72,7 +72,7 @@ class Propellers:
     def __init__(self, config: EnvConfig, vehicle: Vehicle) -> None:
         curve = vehicle.coefficients["rotors.curve"] or (0.0, 0.0, 1.0)
         own = np.polynomial.Polynomial(curve)
-        self._asked = (0.0, 1.0) if config.effects.thrust_curve else tuple(curve)
+        self._asked = (1.0, 0.0) if config.effects.thrust_curve else curve[::-1]
         self._high = vehicle.thrust_high
         self._throttles = np.linspace(0.0, 1.0, 1025)
         self._shares = own(self._throttles)
@@ -85,10 +85,7 @@ class Propellers:
 
     def commands(self, throttles: Floats) -> Floats:
         """Commands of the rotors, N, at throttles from 0 to 1, shape (R,)."""
-        share = 0.0 * throttles
-        for coefficient in reversed(self._asked):
-            share = share * throttles + coefficient
-        return self._high * share
+        return self._high * np.polyval(self._asked, throttles)
 
     def lift(self, throttles: Floats) -> float:
         """Sum of the rotors' thrusts at throttles, N."""
