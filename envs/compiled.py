@@ -134,7 +134,7 @@ class CompiledLoop(Loop):
         for number, array in enumerate(self.arrays):
             self.observations[array.name] = results[f"observation/{number}"]
         self.rewards = results["reward"]
-        self._headline = results["headline"]
+        self.headline = results["headline"]
         self.terminated = results["terminated"]
         self.truncated = results["truncated"]
         self.done = results["done"]

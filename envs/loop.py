@@ -54,6 +54,7 @@ class Loop:
         terminated, truncated: bool, shape (N,).
         done: bool, shape (N,): the world's episode has ended and the next has not begun.
         out: bool, shape (N,): its own has ended.
+        headline: The metric that decides, float64, shape (N,); NaN where the task has none.
 
     Raises:
         InputError: An argument, seed or action is wrong; nothing has changed but as of `advance`.
@@ -302,7 +303,7 @@ class Loop:
         record = self._record
         count = self.num_envs
         self._told = None
-        self._headline: Floats | None = None
+        self.headline: Floats = np.array(self.headline_now(), np.float64).reshape(count)
         known = vars(record).get("observations", {})
         self.observations = {}
         for array in self.arrays if known else self.spec.observation:
@@ -346,14 +347,13 @@ class Loop:
         """Metrics of the task by name, each of shape (N,)."""
         return _per_drone(self._begun().metrics, self.num_envs)
 
-    @property
-    def headline(self) -> Floats:
-        """The metric that decides, shape (N,); NaN where the task has none."""
-        if self._headline is None:
-            metric = self.spec.headline
-            unknown = np.full(self.num_envs, np.nan)
-            self._headline = self.metrics[metric.name] if metric else unknown
-        return self._headline
+    def headline_now(self) -> Array:
+        """The metric that decides, (W, A), as the record has it."""
+        record = self._record
+        metric = self.spec.headline
+        if metric is None or not record.has_begun:
+            return np.nan + record.reward
+        return record.metrics[metric.name]
 
     @property
     def telemetry(self) -> Mapping[str, Floats]:

@@ -303,9 +303,8 @@ class Machine:
     def _seen(self) -> Named:
         """What leaves the loop."""
         record = self._loop.record
-        metric = self._loop.spec.headline
-        headline = record.metrics[metric.name] if metric else np.nan + record.reward
-        seen = {"reward": record.reward, "headline": headline.astype(np.float64)}
+        headline = self._loop.headline_now().astype(np.float64)
+        seen = {"reward": record.reward, "headline": headline}
         for number, array in enumerate(self._loop.arrays):  # their names are the task's
             seen[f"observation/{number}"] = record.observations[array.name].astype(array.dtype)
         if self._loop.instruments:
