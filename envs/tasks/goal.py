@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import Annotated, NamedTuple
 
 import numpy as np
@@ -24,19 +23,16 @@ from ...sim import (
     to_body,
     world_z,
 )
-from ..config import EnvConfig
 from ..spec import ArraySpec, Metric
 from ..state import State
 from .task import Outcome, Task
 
 ERROR_SCALE = 0.5  # Distance at which the reward for nearness crosses zero, m
 RATE_WEIGHT = 0.02  # Cost of a body rate of 1 rad/s
-SWING_WEIGHT = 0.1  # Cost of a payload that moves at 1 m/s relative to the craft
 PASSING_REWARD = 1.0  # Of a course: added in a step in which a point or gate is passed
 COURSE_RATE_WEIGHT = 0.002  # Of a course: cost of a body rate of 1 rad/s
 FASTEST_COUNTED = 20.0  # A faster body rate costs no more, rad/s
 WORST_RATES = -RATE_WEIGHT * FASTEST_COUNTED
-WORST_SWING = -0.4  # Of a payload at 4 m/s or faster
 COURSE_WORST_RATES = -COURSE_RATE_WEIGHT * FASTEST_COUNTED
 COURSE_WORST_STEP = -0.05  # Of a course: a hundredth of the cost of a crash
 LEAST_TILT_COSINE = 0.0
@@ -59,7 +55,6 @@ class Number(NamedTuple):
 
 # Metrics of several tasks.
 POSITION_ERROR = Metric(name="position_error", unit="m", settled=0.1, held=0.1, symbol="e")
-PAYLOAD_ERROR = Metric(name="payload_error", unit="m", settled=0.1, held=0.1, symbol="e")
 FLIGHT_TIME = Metric(name="flight_time", unit="s", final=True)
 
 NumberOrRange = float | tuple[float, float]
@@ -86,25 +81,11 @@ SlowSpeed = Annotated[float, Limits(0.01, MAX_SPEED, "m/s")]
 Upright = Annotated[float, Limits(0.1, 90.0, "degrees")]
 """Of an option: a limit of a tilt, degrees."""
 
-Share = Annotated[float, Limits(0.001, 10.0)]
-"""Of an option: mass of a payload over that of a vehicle."""
-
 Tilt = Annotated[float, Limits(0.0, 80.0, "degrees")]
 """Of an option: largest tilt at the start, degrees."""
 
 Heading = Annotated[float, Limits(-360.0, 360.0, "degrees")]
 """Of an option: a direction about z, degrees, anticlockwise from x."""
-
-
-def with_payload(config: EnvConfig, mass: float, cable: float) -> EnvConfig:
-    """The config with a payload that the task's options describe. Raises `InputError`."""
-    given = [name for name in ("payload", "cable") if name in config.effects.to_options()]
-    if given:
-        raise InputError(
-            "effects: expected a payload that the options of the task describe, "
-            f"got {' and '.join(given)}"
-        )
-    return replace(config, effects=replace(config.effects, payload=mass, cable=cable))
 
 
 class NumbersTask(Task):
@@ -316,9 +297,3 @@ def row_of(rows: Array, index: Array) -> Array:
 def rates_cost(state: State, weight: float) -> Array:
     """Reward for body rates, (W, A): minus the weight times their size, rad/s."""
     return -weight * np.minimum(length(state.body_rates), FASTEST_COUNTED)
-
-
-def swing_cost(state: State) -> Array:
-    """Reward for the speed of a payload relative to the craft, (W, A)."""
-    speed = length(state.payload_velocity - state.velocity)
-    return np.maximum(-SWING_WEIGHT * speed, WORST_SWING)
