@@ -58,26 +58,24 @@ class CompiledLoop(Loop):
             return
         sent = record.sent if flies else None
         flew = record.flown
-        if seeds is not None:
-            seeds = seeds[:: self.config.drones]
         try:
             if flies and self._world.scenery.moves:
                 steps = machine.memory.get("record/kept/steps")
                 fired = machine.memory.get("record/kept/fired") if any(self._throws) else None
                 self._move_solids(steps + (1 if flew is None else flew), fired)
             results, told = machine.step(sent, flew, begun, record.active, record.asked, seeds)
+            if not record.has_begun:
+                record.action = self.pipeline.actions.neutral()
+            record.waiting = results["waiting"].reshape(record.shape)
+            self._give(results)
+            self._told = told
+            if some(results["wrong"]):
+                self._check()
         except BaseException as error:
             self._settle()  # the physics has gone on
             if isinstance(error, PhysicsError):
                 self._undo(flew)
             raise
-        if not record.has_begun:
-            record.action = self.pipeline.actions.neutral()
-        record.waiting = results["waiting"].reshape(record.shape)
-        self._give(results)
-        self._told = told
-        if some(results["wrong"]):
-            self._check()
         self._measure()
 
     def prepare(self) -> None:
@@ -154,11 +152,7 @@ class CompiledLoop(Loop):
         """Raise for bad states, and for numbers that are not finite."""
         flew = self._record.flown
         record = self.record
-        try:
-            self._world.refuse_bad(flew)
-        except PhysicsError:
-            self._undo(flew)
-            raise
+        self._world.refuse_bad(flew)
         refuse_unfit(record, self.config.env_id)
         self._refuse_stuck()
 

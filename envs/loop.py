@@ -118,6 +118,8 @@ class Loop:
         clock.take(record, resets, frozen)
         flies = some(record.flown)
         wanted = None if record.begun is None else checked_seeds(seeds, self.num_envs)
+        if wanted is not None:
+            wanted = wanted[:: self.config.drones]  # of worlds
         if flies:
             record.sent = self.pipeline.actions.checked(actions, record.flown)
             if self.spec.asks:
@@ -198,7 +200,7 @@ class Loop:
         if not record.has_begun and not all_begin:
             record.begin_all(begin)
         if seeds is not None:
-            self._world.random.seed(begun, seeds[:: self.config.drones])
+            self._world.random.seed(begun, seeds)
         record.run(None if all_begin else begun, begin)
 
     def _measure(self) -> None:

@@ -6,7 +6,7 @@ step depends on can be forgotten that a snapshot has.
 """
 
 import ctypes
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from math import prod
 from typing import Any
 
@@ -40,7 +40,6 @@ _TERM = "told/reward_"
 _KEYS = "Flight/random/keys"
 _EPISODE = "Flight/random/episode"
 _SEEDS = "Flight/scenery/seeds"
-_BOOL = np.dtype(bool)
 
 Named = dict[str, Any]
 Step = Sequence[Callable[[Record], None]]
@@ -71,21 +70,20 @@ class Machine:
         world.asked = ours.asked
         self.tape: list[Before] | None = None
         state = loop.state()
-        sent = loop.record.sent
+        record = loop.record
         width = min(widest(), max(2, 1 << (worlds - 1).bit_length()))
         lanes = width * min(LANES // width, -(-worlds // width))
         self._names = tuple(state)
         layout = Layout(fields_of(state), lanes)
         self._told = Layout(fields_of(self._telemetry()), lanes)
-        given: Named = dict.fromkeys(_MASKS, (_BOOL, sent.shape[1:-1]))
-        given["sent"] = (sent.dtype, sent.shape[1:])
-        if loop.record.asked is not None:
-            given["asked"] = (_BOOL, loop.record.asked.shape[1:])
+        given: Named = dict.fromkeys(_MASKS, record.out) | {"sent": record.sent}
+        if record.asked is not None:
+            given["asked"] = record.asked
         pushed = self._pushed()
         self._acts = tuple(pushed)
-        given |= fields_of(world.scenery.shared()) | fields_of(pushed)
-        given |= fields_of({_PHYSICS + name: x for name, x in seen.items()})
-        self._outside = given | fields_of(self._seen())
+        given |= world.scenery.shared() | pushed
+        given |= {_PHYSICS + name: array for name, array in seen.items()}
+        self._outside = fields_of(given | self._seen())
         self._layouts = layout, self._told
         self._calls = [(_before(call), call) for call in loop.pipeline.flight.calls()]
         self._calls[0] = _FIRST, self._calls[0][1]
@@ -128,7 +126,7 @@ class Machine:
                 regions[code] = [take, flown, self._gives(self._pushed)]
         return regions
 
-    def _plan(self, given: Named) -> None:
+    def _plan(self, given: Collection[str]) -> None:
         """Arrays that are given; where all that leaves lies in the bytes of a step, behind what is
         told; and the table of their addresses, which code reads.
         """
@@ -145,7 +143,8 @@ class Machine:
         self._results = np.dtype(fields | {"itemsize": end})
         self._given = {
             name: np.zeros((self.memory.size, *shape), dtype)
-            for name, (dtype, shape) in given.items()
+            for name, (dtype, shape) in self._outside.items()
+            if name in given
         }
         places = [array.ctypes.data for array in self._given.values()]
         self._places = np.array([*places, *starts])
