@@ -61,7 +61,7 @@ class CompiledLoop(Loop):
         try:
             if flies and self._world.scenery.moves:
                 steps = machine.memory.get("record/kept/steps")
-                fired = machine.memory.get("record/kept/fired") if any(self._throws) else None
+                fired = machine.memory.get("record/kept/fired") if self._throws else None
                 self._move_solids(steps + (1 if flew is None else flew), fired)
             results, told = machine.step(sent, flew, begun, record.active, record.asked, seeds)
             if not record.has_begun:
@@ -162,7 +162,7 @@ def _begin(loop: Loop) -> None:
     everybody = np.ones(loop.num_envs, bool)
     for seed in range(_STARTS):
         try:
-            loop.advance(None, everybody, [seed] * loop.num_envs)
+            loop.advance(None, everybody, seed)
         except InputError as error:
             refused = error
         else:

@@ -188,7 +188,7 @@ class Loop:
         period = self._task.control_period
         if scenery.moves:
             starts = None
-            if fired is not None and any(self._throws):
+            if fired is not None:
                 starts = period * fired[..., self._throws].min(axis=1)
             scenery.move(steps >= 0, period * steps[:, 0], starts)
 

@@ -68,7 +68,7 @@ class LocalVectorEnv(AdvancingVectorEnv, VectorEnv[Observation, ArrayLike, Array
         self._renderer = Renderer(render_mode, loop)
         self._take_spec(loop.spec, num_envs, autoreset_mode)
         self.metadata["render_modes"] = RENDER_MODES
-        self._nobody = self.lost = self.done = self.out = loop.done
+        self.lost = self.done = self.out = loop.done
         self.closed = False
 
     def reset(self, *, seed: Seed = None, options: Info | None = None) -> tuple[Observation, Info]:

@@ -35,6 +35,7 @@ from .goal import (
     NumbersTask,
     along,
     ends_of,
+    turned,
 )
 from .measures import METRICS, begin_measures, measures_of, update_measures
 from .task import Outcome, TaskOptions
@@ -205,19 +206,15 @@ class Forest(NumbersTask):
         x, y, _ = parts_of(body_x(state.quaternion))
         size = distance_of(x, y) + 1e-9
         c, s = x / size, y / size
-
-        def turned(a: Array, b: Array) -> tuple[Array, Array]:
-            return c * a + s * b, c * b - s * a
-
         to_goal = self.goal(state) - state.position
-        dx, dy, up = parts_of(to_goal)
         way = Forest.way(self, state.position)  # straight on, also where racks are in it
         wanted = memory.speed / (way + 1e-6)
-        vx, vy, vz = parts_of(state.velocity)
-        ax, ay, az = parts_of(body_z(state.quaternion))
+        ahead = turned(wanted[..., None] * to_goal, c, s)
+        velocity = turned(state.velocity, c, s)
+        axis = turned(body_z(state.quaternion), c, s)
         left = way / memory.speed
         parts = (
-            *turned(wanted * dx, wanted * dy), up, *turned(vx, vy), vz, *turned(ax, ay), az,
+            *parts_of(ahead)[:2], to_goal[..., 2], *parts_of(velocity), *parts_of(axis),
             *parts_of(state.body_rates), state.position[..., 2], way, memory.speed,
             left, *parts_of(memory.last),
         )  # fmt: skip

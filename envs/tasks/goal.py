@@ -222,10 +222,15 @@ class GoalTask(NumbersTask):
         """World vectors in the world frame turned by the wanted heading, shape (..., 3)."""
         if self.wanted == 0.0:
             return vectors
-        c = cos(self.wanted)
-        s = sin(self.wanted)
-        x, y, z = parts_of(vectors)
-        return stack((c * x + s * y, c * y - s * x, z))
+        return turned(vectors, cos(self.wanted), sin(self.wanted))
+
+
+def turned(vectors: Array, c: Array, s: Array) -> Array:
+    """World vectors, (..., 3), in the world frame turned about z by an angle of this cosine and
+    sine, (...).
+    """
+    x, y, z = parts_of(vectors)
+    return stack((c * x + s * y, c * y - s * x, z))
 
 
 def at(point: Sequence[float], like: Array) -> Array:

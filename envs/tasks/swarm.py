@@ -416,7 +416,7 @@ class Escort(Swarm):
 
     def further(self, state: State) -> list[Array]:
         """The velocity of the target, and the neighbours."""
-        return [self.target()[1], *super().further(state)]
+        return [self.goal_velocity(), *super().further(state)]
 
     def goal_velocity(self) -> Array:
         """That of the target."""
