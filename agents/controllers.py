@@ -3,7 +3,7 @@ files.
 """
 
 from collections.abc import Mapping
-from typing import ClassVar, Final, Protocol
+from typing import ClassVar, Protocol
 
 from ..envs.spec import EnvSpec
 from ..models.errors import InputError
@@ -23,7 +23,7 @@ class Controller(Policy, Protocol):
         """Raises `InputError` for an env that it cannot fly."""
 
 
-CONTROLLERS: Final[Mapping[str, type[Controller]]] = {"pid": PID, "geometric": Geometric}
+CONTROLLERS: Mapping[str, type[Controller]] = {"pid": PID, "geometric": Geometric}
 _NEEDED = ("options", "reset", "act")
 
 

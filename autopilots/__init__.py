@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Mapping
 from importlib import import_module
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 from ..models.errors import InputError
 
@@ -41,7 +41,7 @@ class StackInfo(NamedTuple):
         return kind(start)
 
 
-STACKS: Final[Mapping[str, StackInfo]] = {
+STACKS: Mapping[str, StackInfo] = {
     one.name: one
     for one in (
         StackInfo("ardupilot", "ArduPilot", 400.0, ("guided", "auto")),

@@ -7,7 +7,6 @@ import math
 import tomllib
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Final
 
 import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
@@ -21,21 +20,21 @@ from .protocol.frames import ORIGIN, geodetic, north_east_down
 from .reading import Floats, Order, Propellers, Reading
 from .seat import Stack, Start
 
-PERIOD: Final = 0.01
+PERIOD = 0.01
 """Time that its filters and its loop need, s."""
-MOST_ACCELERATION: Final = 5.0
+MOST_ACCELERATION = 5.0
 """Largest horizontal acceleration on the way to a goal, m/s²."""
-TALK_EVERY: Final = 20
+TALK_EVERY = 20
 """Steps between two messages to it."""
-ASK_EVERY: Final = 400
+ASK_EVERY = 400
 """Steps between two requests for reports of its estimate, until they say that it is ready."""
-MOVED: Final = 0.05
+MOVED = 0.05
 """Least distance between the goals of two missions, m."""
-_EARTH: Final = 6_378_100.0
+_EARTH = 6_378_100.0
 """Radius that it takes for the earth's, m: RADIUS_OF_EARTH."""
-_TABLES: Final = tomllib.loads(Path(__file__).with_suffix(".toml").read_text())
-_NEAR: Final = 25.0  # °: between a rotor and the place of its motor
-_OPTIONS: Final = (
+_TABLES = tomllib.loads(Path(__file__).with_suffix(".toml").read_text())
+_NEAR = 25.0  # °: between a rotor and the place of its motor
+_OPTIONS = (
     "--serial1=none:0",
     "--serial2=none:0",
     "--defaults=vehicle.parm",
@@ -43,15 +42,15 @@ _OPTIONS: Final = (
     "--speedup=1000",
     "--start-time=1700000000",  # GPS tells it the time
 )
-_FORCED: Final = 21196  # to arm without checks
-_READY: Final = (
+_FORCED = 21196  # to arm without checks
+_READY = (
     mavlink.EKF_ATTITUDE
     | mavlink.EKF_VELOCITY_HORIZ
     | mavlink.EKF_VELOCITY_VERT
     | mavlink.EKF_POS_HORIZ_REL
     | mavlink.EKF_POS_HORIZ_ABS
 )
-_POSITION_AND_YAW: Final = 0b100111111000  # what a setpoint leaves out has its bit set
+_POSITION_AND_YAW = 0b100111111000  # what a setpoint leaves out has its bit set
 
 
 def motor_order(vehicle: Vehicle) -> tuple[int, int, list[int]]:

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from contextlib import closing
 from functools import cache
 from pathlib import Path
-from typing import Final, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -21,28 +21,28 @@ from .reading import Floats, Order, Propellers, Reading
 from .seat import Stack, Start
 from .sticks import StickPilot
 
-BOOT: Final = 8.0
+BOOT = 8.0
 """Time until it arms, s of its clock: the gyro's calibration, and the grace after power on."""
-ARMING: Final = 0.5
+ARMING = 0.5
 """Time with the throttle down after the switch, s."""
-IDLE: Final = 0.055
+IDLE = 0.055
 """Throttle of its motors while they idle."""
-FULL_ANGLE: Final = 60.0
+FULL_ANGLE = 60.0
 """Angle of a full stick, °."""
-APART: Final = 10
+APART = 10
 """Between the ports of two programs."""
-MOST_MOTORS: Final = 8
-AT_ONCE: Final = 8
+MOST_MOTORS = 8
+AT_ONCE = 8
 """Commands that its CLI is given together: they and the answers fit into its buffers."""
-FOREVER: Final = 10**6
+FOREVER = 10**6
 """Longer than a program is configured, s of its clock."""
-_PROMPT: Final = "# "
-_LOWEST: Final = 1050.0  # µs: throttle 0
+_PROMPT = "# "
+_LOWEST = 1050.0  # µs: throttle 0
 _ARM, _ANGLE = 4, 5  # channels
 _AXES = ("roll", "pitch", "yaw")
-_MEMORY: Final = "eeprom.bin"
-_SOURCE: Final = Path(__file__).with_name("betaflight_lockstep.c")
-_CONFIG: Final = """\
+_MEMORY = "eeprom.bin"
+_SOURCE = Path(__file__).with_name("betaflight_lockstep.c")
+_CONFIG = """\
 aux 0 0 0 1700 2100 0 0
 aux 1 1 1 1700 2100 0 0
 set acc_calibration = 0,0,0,1
@@ -57,13 +57,13 @@ set angle_feedforward = 0
 mixer CUSTOM
 mmix reset
 """
-REFERENCE_LAG: Final = 0.02
+REFERENCE_LAG = 0.02
 """Lag of the rotors for which its default gains are made, s."""
-_RATE_GAIN: Final = 94.0
+_RATE_GAIN = 94.0
 """Rate loops of roll and pitch of its default gains on a racer of 0.68 kg, 1/s."""
-_FASTER: Final = 5.25
+_FASTER = 5.25
 """Limit of the same, over those of our loops."""
-_PER_P: Final = math.degrees(0.032029) / 1000.0
+_PER_P = math.degrees(0.032029) / 1000.0
 """Mixer output of a gain P of 1 for an error of 1 rad/s."""
 
 

@@ -2,7 +2,6 @@
 
 import math
 from pathlib import Path
-from typing import Final
 
 import numpy as np
 
@@ -14,19 +13,19 @@ from .protocol import crazyflie as protocol
 from .reading import Floats, Order, Propellers, Reading
 from .seat import Stack, Start
 
-BOOT: Final = 4.0
+BOOT = 4.0
 """Time until it takes goals, s of its clock: it finds the gyro's bias from 1024 samples at rest."""
-POSE_EVERY: Final = 10
+POSE_EVERY = 10
 """Steps between two poses, as motion capture gives them at 100 Hz."""
-ORDER_EVERY: Final = 20
-PATIENCE: Final = 5.0
+ORDER_EVERY = 20
+PATIENCE = 5.0
 """Time from which the goal of a craft that still stands climbs, s of its clock."""
-_CLIMB: Final = np.array((0.0, 0.0, 0.1))
+_CLIMB = np.array((0.0, 0.0, 0.1))
 """That climb, m/s: INDI takes thrust from a craft that does not move."""
-_CORNERS: Final = [[1, -1], [-1, -1], [-1, 1], [1, 1]]
+_CORNERS = [[1, -1], [-1, -1], [-1, 1], [1, 1]]
 """Signs of x and y of its motors."""
-_FULL: Final = 65535.0
-_SOURCE: Final = Path(__file__).with_name("crazyflie_lockstep.c")
+_FULL = 65535.0
+_SOURCE = Path(__file__).with_name("crazyflie_lockstep.c")
 
 
 def parameters(vehicle: Vehicle, propellers: Propellers) -> list[bytes]:

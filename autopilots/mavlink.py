@@ -4,7 +4,7 @@ import socket
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import suppress
-from typing import Final, TypeVar
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,21 +25,21 @@ Row = Mapping[str, Array]
 Flown = AdvancingVectorEnv | World
 Frame = TypeVar("Frame")
 
-POSE_PERIOD: Final = 0.02
+POSE_PERIOD = 0.02
 """Least time between two poses of a drone, s of the clock on the wall: a flight that is faster than
 real time would flood its receiver.
 """
-BEAT_PERIOD: Final = 1.0
+BEAT_PERIOD = 1.0
 """Least time between two heartbeats, likewise."""
-MOST_DRONES: Final = 254
+MOST_DRONES = 254
 """System 255 is the ground station."""
-_NEEDED: Final = ("position", "attitude", "velocity", "body_rates", "thrust")
-_TYPES: Final = {4: common.MAV_TYPE_QUADROTOR, 6: common.MAV_TYPE_HEXAROTOR}
-_ACTUATORS: Final = 32  # of a message
-_CELLS: Final = 10
-_UNKNOWN: Final = 65535
-_FASTEST: Final = 327.0  # m/s, of a message
-_HIGHEST: Final = 65.0  # V, likewise
+_NEEDED = ("position", "attitude", "velocity", "body_rates", "thrust")
+_TYPES = {4: common.MAV_TYPE_QUADROTOR, 6: common.MAV_TYPE_HEXAROTOR}
+_ACTUATORS = 32  # of a message
+_CELLS = 10
+_UNKNOWN = 65535
+_FASTEST = 327.0  # m/s, of a message
+_HIGHEST = 65.0  # V, likewise
 
 
 class MavlinkOut:

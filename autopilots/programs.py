@@ -14,7 +14,7 @@ from contextlib import ExitStack, suppress
 from functools import cache
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Final, TypeVar
+from typing import TypeVar
 
 from ..models import InputError
 from ..udp.protocol.errors import PeerClosed, PeerSilent
@@ -24,7 +24,7 @@ ANSWER = 5.0
 """Longest time for an answer, s."""
 _MOST = 16
 """Of one kind that run side by side."""
-_BEHIND: Final = 0.005  # s: a longer delay of real time is not made up for
+_BEHIND = 0.005  # s: a longer delay of real time is not made up for
 _LOG = "output.txt"
 
 Answer = TypeVar("Answer")

@@ -4,7 +4,6 @@ import socket
 import time
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Final
 
 import numpy as np
 from pymavlink.dialects.v20 import common
@@ -18,25 +17,25 @@ from .protocol import px4 as protocol
 from .reading import Floats, Order, Propellers, Reading
 from .seat import Stack, Start
 
-BOOT: Final = 5.0
+BOOT = 5.0
 """Time until it gets orders, s of its clock: its estimate has to settle first."""
-CONNECT: Final = 30.0
+CONNECT = 30.0
 """Longest time until it connects, s."""
-UNHEARD: Final = 1.0 / protocol.RATE
+UNHEARD = 1.0 / protocol.RATE
 """Time that a step waits for outputs before there were any, s."""
-_ABOVE: Final = np.array((0.0, 0.0, 2.0))  # m: it lifts off for a goal above it alone
-GPS_EVERY: Final = 25
+_ABOVE = np.array((0.0, 0.0, 2.0))  # m: it lifts off for a goal above it alone
+GPS_EVERY = 25
 """Steps between two fixes."""
-ORDER_EVERY: Final = 10
+ORDER_EVERY = 10
 """Steps between two setpoints: it wants more than two a second."""
-COMMAND_EVERY: Final = 250
+COMMAND_EVERY = 250
 """Steps between two requests to arm and to fly by setpoints."""
-LAG: Final = 0.03
+LAG = 0.03
 """With which the rotors are taken to follow, s: its filters add to their own."""
-_MAIN_MOTOR: Final = 101  # function of an output: the first motor
-_WE: Final = (245, common.MAV_COMP_ID_ONBOARD_COMPUTER)
-_BUILD: Final = Path("build/px4_sitl_default")
-_PARAMETERS: Final = {
+_MAIN_MOTOR = 101  # function of an output: the first motor
+_WE = (245, common.MAV_COMP_ID_ONBOARD_COMPUTER)
+_BUILD = Path("build/px4_sitl_default")
+_PARAMETERS = {
     "COM_RC_IN_MODE": 4.0,  # no sticks
     "SDLOG_MODE": -1.0,
     "MPC_TKO_RAMP_T": 0.0,  # its integrators would wind up while it stands under thrust
@@ -53,12 +52,9 @@ def parameters(vehicle: Vehicle, propellers: Propellers) -> dict[str, float]:
         found[f"CA_ROTOR{number}_PY"] = -y
         found[f"CA_ROTOR{number}_KM"] = -rotor.reaction[2]
         found[f"PWM_MAIN_FUNC{number + 1}"] = _MAIN_MOTOR + number
-    hover = propellers.share
-    throttle = propellers.hover
-    # Its thrust at a throttle u is f u² + (1 - f) u; here f is right at hover.
-    found["THR_MDL_FAC"] = (hover - throttle) / (throttle**2 - throttle)
-    found["MPC_THR_HOVER"] = hover
-    found["MPC_THR_MIN"] = hover / 4.0
+    found["THR_MDL_FAC"] = propellers.expo
+    found["MPC_THR_HOVER"] = propellers.share
+    found["MPC_THR_MIN"] = propellers.share / 4.0
     lag = vehicle.coefficients["rotors.time_constant"] or 0.0
     gains = Gains.of(vehicle, 1.0 / protocol.RATE, LEAD * max(lag, LAG))  # no lead of its own
     for axis, name in enumerate(("ROLL", "PITCH", "YAW")):

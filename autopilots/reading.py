@@ -66,7 +66,7 @@ class Propellers:
         share: Thrust of a hover over the largest.
         hover: Throttle of a hover.
         slope: Of the thrust over the throttle there, N, shape (R,).
-        expo: Of ArduPilot's curve of thrust, the nearest to this one.
+        expo: E of E u² + (1 - E) u, the form of ArduPilot and PX4 that is nearest to the curve.
     """
 
     def __init__(self, config: EnvConfig, vehicle: Vehicle) -> None:

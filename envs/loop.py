@@ -16,7 +16,7 @@ from ..sim import Array, PhysicsError, World, make_world
 from ..sim.sensors.instruments import Moment
 from ..sim.snapshots import Arrays, Snapshot, joined, part_of
 from ..sim.state import ByName, found, is_traced, some
-from .autoreset import Content, Seed, Seeds, Told, checked_seeds, stacked
+from .autoreset import Seed, Seeds, Told, checked_seeds, stacked
 from .config import EnvConfig
 from .events import BALL, balls_of
 from .pipeline import Pipeline

@@ -6,7 +6,7 @@ An id from a checkpoint, a journal or a peer is looked up here; its module is ne
 import os
 import sys
 from importlib import import_module
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING
 
 import gymnasium
 
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from .tasks.task import Task
 
 _ID = Text(r"([\w.-]+/)?[\w.-]+-v\d+", "name-v0 or namespace/name-v0")
-_tasks: Final[dict[str, "str | type[Task]"]] = {}
+_tasks: dict[str, "str | type[Task]"] = {}
 
 
 def register(env_id: str, task: "str | type[Task]") -> None:

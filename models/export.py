@@ -2,7 +2,6 @@
 
 import os
 from pathlib import Path
-from xml.etree import ElementTree
 
 from .errors import InputError
 from .files import check_new_file, write_whole
@@ -17,13 +16,12 @@ def export_mjcf(vehicle: Path | str, out: Path) -> None:
     check_new_file(out, ".xml")
     path = find_vehicle(vehicle)
     Vehicle.load(path)  # refuses what cannot fly
+    spec = read_spec(path)
+    for key in ("meshdir", "texturedir"):  # as seen from `out`
+        folder = model_of(path).parent / getattr(spec, key)
+        setattr(spec, key, os.path.relpath(folder, out.resolve().parent))
     try:
-        root = ElementTree.fromstring(read_spec(path).to_xml())
+        text = spec.to_xml()
     except (ValueError, RuntimeError) as error:
         raise InputError(f"vehicle: expected a model that MuJoCo can write, got {error}") from None
-    for compiler in root.iter("compiler"):  # folders of meshes and textures, as seen from `out`
-        for key in ("meshdir", "texturedir"):
-            folder = model_of(path).parent / compiler.get(key, "")
-            compiler.set(key, os.path.relpath(folder, out.resolve().parent))
-    text = ElementTree.tostring(root, encoding="unicode") + "\n"
     write_whole(out, text)

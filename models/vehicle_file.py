@@ -8,7 +8,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Any, Final, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -60,7 +60,7 @@ class Cylinder:
     axis: Axis = UP
 
 
-_SHAPES: Final[Mapping[str, type[Box | Cylinder]]] = {"box": Box, "cylinder": Cylinder}
+_SHAPES: Mapping[str, type[Box | Cylinder]] = {"box": Box, "cylinder": Cylinder}
 
 
 @immutable

@@ -3,7 +3,7 @@
 import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any
 
 from ..models.errors import InputError, shortened
 from .options import SceneOptions
@@ -29,7 +29,7 @@ class SceneType:
     """Whether some of its solids move."""
 
 
-SCENES: Final[dict[str, SceneType]] = {"plain": SceneType(), "airport": SceneType()}
+SCENES: dict[str, SceneType] = {"plain": SceneType(), "airport": SceneType()}
 """Scenes by name."""
 
 

@@ -6,7 +6,7 @@ Body axes are x forward, y right, z down; the world is x north, y east, z down.
 import json
 import struct
 from collections.abc import Mapping
-from typing import Final, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,7 +18,7 @@ from .frames import angles_of, forward_right_down, north_east_down
 _HEADER = struct.Struct("<HHI")
 _CHANNELS = {18458: 16, 29569: 32}
 _LOW, _HIGH = 1000.0, 2000.0  # µs
-FIRST: Final = 0.001
+FIRST = 0.001
 """Time stamp of the first state, s: at 0 the program takes the time of its computer."""
 
 

@@ -1,14 +1,13 @@
 """Betaflight's simulator protocol: bytes of datagrams, and words of its CLI. No socket, no clock.
 
 Body axes of ours are x forward, y left, z up. What Betaflight takes for them was found by flying
-it, and differs between releases: see `YAW`.
+it, and differs between releases: see `YAW_TURNED`.
 """
 
 import math
 import re
 import struct
 from collections.abc import Sequence
-from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,12 +15,12 @@ from numpy.typing import NDArray
 from ...models import InputError
 from ..reading import Reading
 
-MOTORS_PORT: Final = 9001
-STATE_PORT: Final = 9003
-STICKS_PORT: Final = 9004
-CLI_PORT: Final = 5761
-YAW: Final = {(2026, 6): 1.0, (0, 0): -1.0}
-"""Sign of the gyro's z, by the first release, year and month; the newest first."""
+MOTORS_PORT = 9001
+STATE_PORT = 9003
+STICKS_PORT = 9004
+CLI_PORT = 5761
+YAW_TURNED = (2026, 6)
+"""The first release, year and month, whose gyro has z the other way."""
 
 _STATE = struct.Struct("<18d")
 _STICKS = struct.Struct("<d16H")
@@ -39,7 +38,7 @@ def version_of(text: str) -> tuple[int, int]:
 
 def yaw_of(version: tuple[int, int]) -> float:
     """Sign of the gyro's z of a release."""
-    return next(sign for first, sign in YAW.items() if version >= first)
+    return 1.0 if version >= YAW_TURNED else -1.0
 
 
 def state_packet(reading: Reading, time: float, yaw: float) -> bytes:

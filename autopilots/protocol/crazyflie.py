@@ -4,7 +4,6 @@ A packet is a header, of port and channel, and its content. Frames are ours.
 """
 
 import struct
-from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,15 +11,15 @@ from numpy.typing import NDArray
 from ...models import InputError
 from ..reading import Order, Reading
 
-PORT: Final = 19950
+PORT = 19950
 """Of the simulator."""
-CLIENT_PORT: Final = 19850
+CLIENT_PORT = 19850
 """Where clients such as cflib look for a Crazyflie."""
-HELLO: Final = b"\xf3"
+HELLO = b"\xf3"
 """The firmware's first packet, and the answer."""
-NOTHING: Final = b"\xff"
+NOTHING = b"\xff"
 """A packet without content, by which clients find and hold a link."""
-G: Final = 9.81
+G = 9.81
 """Of the firmware, m/s²."""
 
 _PER_G = 2048.0

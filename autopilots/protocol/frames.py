@@ -4,7 +4,6 @@ Ours are x east, y north, z up, and x forward, y left, z up.
 """
 
 import math
-from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,10 +12,10 @@ from ...sim.rotations import axes_of
 
 Floats = NDArray[np.float64]
 
-ORIGIN: Final = (47.377, 8.542, 408.0)
+ORIGIN = (47.377, 8.542, 408.0)
 """Latitude and longitude of the world's origin, °, and its altitude above sea level, m: Zurich, as
 of the magnetometer's field."""
-_RADIUS: Final = 6_371_000.0  # m: of the sphere that PX4's map projection takes for the earth
+_RADIUS = 6_371_000.0  # m: of the sphere that PX4's map projection takes for the earth
 
 
 def north_east_down(vector: Floats) -> list[float]:

@@ -5,7 +5,7 @@ x forward, y right, z down; the world is x north, y east, z down.
 """
 
 import math
-from typing import Final, TypeAlias
+from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,27 +20,27 @@ from . import frames
 
 Message: TypeAlias = common.MAVLink_message
 
-PORT: Final = 4560
+PORT = 4560
 """Of the simulator, TCP. An instance moves each port by its number."""
-OFFBOARD_PORT: Final = 14540
+OFFBOARD_PORT = 14540
 """To which PX4 sends what an offboard computer reads, UDP."""
-ORDERS_PORT: Final = 14580
+ORDERS_PORT = 14580
 """At which it listens to that computer."""
-RATE: Final = 250.0
+RATE = 250.0
 """Of the sensors of a simulator, Hz, and so of its rate loop."""
-OFFBOARD: Final = 6
+OFFBOARD = 6
 """Its main mode in which it follows setpoints from outside."""
 
-_FIELD: Final = np.array(SENSOR_TYPES["magnetometer"].about.settings["field"].default)
-_GAUSS: Final = 0.01  # per µT
-_TEMPERATURE: Final = 15.0  # °C
-_ALIVE: Final = 1e-3  # G/s and °C/s: PX4 takes values within 1e-6 of each other for equal
-_FIELDS: Final = 0x1BFF  # of HIL_SENSOR: all but the differential pressure
-_FIX: Final = 3  # in three dimensions
-_ACCURACY: Final = 50  # cm, of the position that GPS claims
-_SATELLITES: Final = 12
-_NO_COURSE: Final = 65535  # PX4 reads the velocity
-_POSITION_AND_YAW: Final = 0b100111111000  # what a setpoint leaves out has its bit set
+_FIELD = np.array(SENSOR_TYPES["magnetometer"].about.settings["field"].default)
+_GAUSS = 0.01  # per µT
+_TEMPERATURE = 15.0  # °C
+_ALIVE = 1e-3  # G/s and °C/s: PX4 takes values within 1e-6 of each other for equal
+_FIELDS = 0x1BFF  # of HIL_SENSOR: all but the differential pressure
+_FIX = 3  # in three dimensions
+_ACCURACY = 50  # cm, of the position that GPS claims
+_SATELLITES = 12
+_NO_COURSE = 65535  # PX4 reads the velocity
+_POSITION_AND_YAW = 0b100111111000  # what a setpoint leaves out has its bit set
 
 
 def microseconds(reading: Reading) -> int:

@@ -10,7 +10,7 @@ Frames: world, z up, and the body's. Position and velocity are those of the body
 
 import math
 from collections.abc import Mapping
-from typing import Final, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -28,7 +28,7 @@ rotors over the mass, body frame, m/s²; the angular acceleration by the torque 
 mass, body frame, rad/s²; the force at the body's origin over the mass, world frame, m/s²."""
 
 _NOTHING = 1e-12  # of the largest number of its kind: what rounding leaves
-_ZERO: Final[Vector] = (0.0, 0.0, 0.0)
+_ZERO: Vector = (0.0, 0.0, 0.0)
 _FURTHEST = (4 * math.pi) ** 2
 _SINGLE, _DOUBLE = elementary.wave_series(8), elementary.wave_series(13)
 """Up to π / 2 the next terms are below the rounding of float32, and of float64."""

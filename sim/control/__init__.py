@@ -5,7 +5,7 @@ within bounds, or is one of some choices.
 """
 
 from collections.abc import Sequence
-from typing import Final, Protocol, cast
+from typing import Protocol, cast
 
 import numpy as np
 
@@ -16,7 +16,7 @@ from ..state import Array, WorldState, clip, stack, total
 from .cascade import AroundHover, Attitude, Numbers, Position, Rates, Velocity
 from .gains import Gains, shared_ranges
 
-_CASCADE: Final[dict[str, type[Rates]]] = {
+_CASCADE: dict[str, type[Rates]] = {
     "rates": Rates,
     "attitude": Attitude,
     "velocity": Velocity,

@@ -8,7 +8,7 @@ World frame: x east, y north, z up. Arrays have the leading axes of the world.
 """
 
 from collections.abc import Mapping
-from typing import Any, Final
+from typing import Any
 
 from ... import models
 from ...models.errors import InputError
@@ -23,7 +23,7 @@ from .estimator import Estimator
 from .imu import Imu
 from .simple import Gps, Magnetometer, MotionCapture, Rangefinder
 
-SENSOR_TYPES: Final[Mapping[str, type[Sensor]]] = {
+SENSOR_TYPES: Mapping[str, type[Sensor]] = {
     kind.about.name: kind
     for kind in (Imu, Magnetometer, Barometer, Rangefinder, Gps, MotionCapture)
 }

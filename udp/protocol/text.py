@@ -10,7 +10,6 @@ is written as the float64 of the same value. Telemetry is in the paper's frame.
 import re
 from collections.abc import Callable, Iterable
 from math import isfinite, prod
-from typing import Final
 
 import numpy as np
 
@@ -79,7 +78,7 @@ def _converted(telemetry: Iterable[Array], layout: Layout, *, to_paper: bool) ->
 
 _Conversion = Callable[[Array], Array]
 
-_CONVERSIONS: Final[dict[tuple[tuple[int, ...], str], tuple[_Conversion, _Conversion]]] = {
+_CONVERSIONS: dict[tuple[tuple[int, ...], str], tuple[_Conversion, _Conversion]] = {
     ((3,), "world"): (positions_in_paper_frame, positions_in_world_frame),
     ((4,), "body to world"): (attitudes_in_paper_frame, quaternions_in_world_frame),
     # The paper's axes are left-handed: rotations about them have the other sign.

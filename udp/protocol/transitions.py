@@ -3,7 +3,7 @@
 One table for each side says what a message does, sent or received.
 """
 
-from typing import Final, Literal, TypeVar
+from typing import Literal, TypeVar
 
 from ...models.files import read_own_toml
 from . import messages
@@ -29,5 +29,5 @@ def _read(side: str) -> dict[S, dict[Move, S]]:
     return table
 
 
-SIMULATOR: Final[dict[SimulatorState, dict[Move, SimulatorState]]] = _read("simulator")
-AGENT: Final[dict[AgentState, dict[Move, AgentState]]] = _read("agent")
+SIMULATOR: dict[SimulatorState, dict[Move, SimulatorState]] = _read("simulator")
+AGENT: dict[AgentState, dict[Move, AgentState]] = _read("agent")
