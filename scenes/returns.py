@@ -72,8 +72,6 @@ class Reading(NamedTuple):
     """m, (rows, columns); `reach` where nothing returned."""
     reach: float
     """m."""
-    is_flat: bool
-    """Whether distances are measured along the sensor's axis, as in a depth image."""
     origin: Array
     """Of the rays, world frame, m, (3,)."""
     points: Array

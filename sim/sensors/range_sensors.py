@@ -109,8 +109,8 @@ class RangeSensor(Instrument):
         sensor = _rays_of(kind, values)
         turn = _turn(math.radians(values["yaw"]), math.radians(values["pitch"]))
         along = sensor.directions[..., 0].ravel()
-        self._is_flat = kind != "lidar" and "directions" not in values
-        self._scale = (along if self._is_flat else np.ones_like(along)).astype(np.float32)
+        is_flat = kind != "lidar" and "directions" not in values
+        self._scale = (along if is_flat else np.ones_like(along)).astype(np.float32)
         self._mount = np.array(values["position"])
         self.errors = ErrorModel(**{name: values[name] for name in ErrorModel._fields})
         self.shape = sensor.directions.shape[:2]
@@ -119,7 +119,7 @@ class RangeSensor(Instrument):
         self.rays = Rays(sensor.directions @ turn.T, ends.reshape(self.shape))
         grid = ("ring", "azimuth") if kind == "lidar" else ("row", "column")
         self.axes = () if "directions" in values else grid
-        what = "along the axis of the sensor" if self._is_flat else "along each ray"
+        what = "along the axis of the sensor" if is_flat else "along each ray"
         self.frame = f"body, {what}"
 
     def read(self, moment: Moment, due: ByName) -> ByName:
@@ -140,7 +140,7 @@ class RangeSensor(Instrument):
         position, attitude = np.split(pose, [3])
         origin = position + to_world(attitude, self._mount)
         points = position + to_world(attitude, rays)
-        return Reading(self.name, distances, reach, self._is_flat, origin, points)
+        return Reading(self.name, distances, reach, origin, points)
 
     def _read(self, moment: Moment, due: Array) -> Array:
         worlds, drones = due.shape

@@ -27,9 +27,7 @@ YELLOW, BLUE = (239, 249, 33), (12, 7, 135)  # the ends of the colours, of 255
 
 
 def one_ray(distance: float, point: tuple[float, ...], origin: tuple[float, ...]) -> Reading:
-    return Reading(
-        "tof", np.full((1, 1), distance), 10.0, False, np.array(origin), np.array([[point]])
-    )
+    return Reading("tof", np.full((1, 1), distance), 10.0, np.array(origin), np.array([[point]]))
 
 
 def test_points_are_where_rays_ended() -> None:
@@ -116,7 +114,7 @@ def test_a_depth_image_is_an_inset_below_its_scale() -> None:
     picture = np.zeros((360, 640, 3), np.uint8)
     distances = np.full((2, 4), 10.0)
     distances[0, 1] = 0.0
-    reading = Reading("depth", distances, 10.0, True, np.zeros(3), np.zeros((2, 4, 3)))
+    reading = Reading("depth", distances, 10.0, np.zeros(3), np.zeros((2, 4, 3)))
     add_insets(picture, replace(at(5.0), readings=[reading]))
     side = 64  # pixels of a cell: 0.4 of 640 over 4 columns
     inset = picture[6 : 6 + 3 * side, 640 - 6 - 4 * side : 634].astype(int)
@@ -128,14 +126,16 @@ def test_a_depth_image_is_an_inset_below_its_scale() -> None:
     assert not outside.any()
 
 
-def test_a_lidar_is_seen_from_above() -> None:
-    """One return 10 m ahead and 5 m to the left, in the world: 20 cells up and 10 to the left."""
-    picture = np.zeros((164, 2000, 3), np.uint8)
-    reading = one_ray(0.0, (13.0, 9.0, 1.0), (3.0, 4.0, 1.0))._replace(name="lidar")
+def test_a_lidar_has_a_row_for_each_ring() -> None:
+    picture = np.zeros((360, 640, 3), np.uint8)
+    distances = np.full((3, 32), 10.0)
+    distances[1, 20] = 0.0
+    reading = Reading("lidar", distances, 10.0, np.zeros(3), np.zeros((3, 32, 3)))
     add_insets(picture, replace(at(5.0), readings=[reading]))
-    inset = picture[6:88, 2000 - 6 - 81 : 1994].astype(int)
-    yellow = (abs(inset - YELLOW) < 3).all(axis=2)
-    assert np.argwhere(yellow[1:]).tolist() == [[20, 30]]
+    side = 8  # pixels of a cell: 0.4 of 640 over 32 columns
+    inset = picture[6 : 6 + 4 * side, 640 - 6 - 32 * side : 634].astype(int)
+    yellow = (abs(inset - YELLOW) < 3).all(axis=2)[side::side, ::side]
+    assert np.argwhere(yellow).tolist() == [[1, 20]]
 
 
 @pytest.fixture(scope="module")
