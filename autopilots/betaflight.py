@@ -7,7 +7,6 @@ from collections.abc import Iterator
 from contextlib import closing
 from functools import cache
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 
@@ -99,14 +98,6 @@ def configuration(
         yield f"set {name} = {min(round(value), 250)}"
 
 
-class Firmware(NamedTuple):
-    """A program's release, and its memory with a configuration."""
-
-    version: tuple[int, int]
-    """Year and month."""
-    memory: bytes
-
-
 def new_program(lockstep: bool, alone: int = 2) -> tuple[Program, dict[str, str]]:
     """A program that may run, and its environment. In lock-step it has ports of its own, and its
     clock runs `alone` for so many s, as fast as it can, before it waits for the first state.
@@ -155,8 +146,11 @@ def _told(link: socket.socket, *commands: str, end: str = _PROMPT) -> str:
 
 
 @cache
-def configured(path: Path | None, commands: tuple[str, ...], lockstep: bool) -> Firmware:
-    """What a program becomes by commands of its CLI. It runs once for this.
+def configured(
+    path: Path | None, commands: tuple[str, ...], lockstep: bool
+) -> tuple[tuple[int, int], bytes]:
+    """A program's release, year and month, and its memory after commands of its CLI. It runs once
+    for this.
 
     Raises `InputError`, or `PeerSilent`.
     """
@@ -172,7 +166,7 @@ def configured(path: Path | None, commands: tuple[str, ...], lockstep: bool) -> 
                 for first in range(0, len(commands), AT_ONCE):
                     _told(link, *commands[first : first + AT_ONCE])
                 _told(link, "save", end="Rebooting")
-            return Firmware(version, (program.folder / _MEMORY).read_bytes())
+            return version, (program.folder / _MEMORY).read_bytes()
         except OSError as error:
             raise program.silent(f"its CLI, got none: {error}") from None
 

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
+from ..agents.export.crazyflie import MOTORS
 from ..agents.policies import Observation
 from ..models import InputError, Vehicle
 from . import find_stack
@@ -22,8 +23,6 @@ PATIENCE = 5.0
 """Time from which the goal of a craft that still stands climbs, s of its clock."""
 _CLIMB = np.array((0.0, 0.0, 0.1))
 """That climb, m/s: INDI takes thrust from a craft that does not move."""
-_CORNERS = [[1, -1], [-1, -1], [-1, 1], [1, 1]]
-"""Signs of x and y of its motors."""
 _FULL = 65535.0
 _SOURCE = Path(__file__).with_name("crazyflie_lockstep.c")
 
@@ -80,8 +79,8 @@ class Crazyflie(Stack):
 
     def __init__(self, start: Start) -> None:
         config, vehicle, mode, path, real_time, _ = start
-        corners = [np.sign(rotor.position[:2]).tolist() for rotor in vehicle.rotors]
-        if corners != _CORNERS:
+        corners = np.sign([rotor.position[:2] for rotor in vehicle.rotors]).tolist()
+        if corners != [*map(list, MOTORS)]:
             raise InputError(
                 "crazyflie: expected four rotors, clockwise from the front right, "
                 f"got {vehicle.name} with rotors at {corners}"
@@ -92,7 +91,7 @@ class Crazyflie(Stack):
             packet = protocol.parameter_packet("stabilizer", "controller", "B", controller)
             self._parameters.append(packet)
         program = Program("crazyflie", protocol.PORT, (protocol.CLIENT_PORT,), apart=1)
-        super().__init__(program, len(_CORNERS))
+        super().__init__(program, len(MOTORS))
         self._client = Client(program)
         environment = {"LD_PRELOAD": program.library(_SOURCE)}
         if real_time:

@@ -64,12 +64,10 @@ class Vehicle(Command):
 
     def run(self) -> int | None:
         """Do it."""
-        if self.action == "export" and self.out is None:
+        if (self.action == "export") != bool(self.out):
             raise InputError(
-                "vehicle: expected two files, that of the vehicle and that to write, got one"
+                f"vehicle: expected OUT.xml with export alone, got {self.action} and {self.out}"
             )
-        if self.action != "export" and self.out is not None:
-            raise InputError(f"vehicle: expected one file for {self.action}, got {self.out} too")
         if "frame" in self.given and self.action != "new":
             raise InputError(f"frame: expected no --frame but with new, got {self.frame}")
         act: Callable[[], int | None] = getattr(self, f"_{self.action}")

@@ -36,8 +36,9 @@ class Told(NamedTuple):
     moment: Any
 
     def __call__(self) -> Content:
-        telemetry, terms = self.read((self.moment,))
-        return {name: x[0] for name, x in telemetry.items()}, {n: x[0] for n, x in terms.items()}
+        read = self.read((self.moment,))
+        telemetry, terms = ({name: x[0] for name, x in part.items()} for part in read)
+        return telemetry, terms
 
 
 def stacked(moments: Sequence[Content]) -> Content:

@@ -21,7 +21,7 @@ _FOLDER = Path(__file__).with_name("crazyflie_app")
 _NAMES = read_own_toml(str(_FOLDER / "names"), "names")
 _CALLS = 1000
 """Of the controller, per second."""
-_MOTORS = ((1, -1), (-1, -1), (-1, 1), (1, 1))
+MOTORS = ((1, -1), (-1, -1), (-1, 1), (1, 1))
 """Signs of x and y of the motors M1 to M4, which turn anticlockwise and clockwise in turn."""
 _REFUSED = ("thrust_curve", "battery", "efficiency")
 """Effects with which a command is no thrust in newtons; the firmware's is one."""
@@ -102,7 +102,7 @@ def _rotor_of_motors(rotors: dict[str, list[float]]) -> list[int]:
     """The rotor that is each motor. Raises `InputError` for another kind of craft."""
     signs = np.sign(np.reshape(rotors["positions"], (-1, 3))[:, :2]).astype(int)
     places = [tuple(row) for row in signs.tolist()]
-    found = [places.index(place) for place in _MOTORS if place in places]
+    found = [places.index(place) for place in MOTORS if place in places]
     turns = [rotors["turns"][rotor] for rotor in found]
     if len(places) != 4 or turns != [1, -1, 1, -1] or min(rotors["least"]) < 0.0:
         raise InputError(
