@@ -17,9 +17,10 @@ def export_mjcf(vehicle: Path | str, out: Path) -> None:
     path = find_vehicle(vehicle)
     Vehicle.load(path)  # refuses what cannot fly
     spec = read_spec(path)
-    for key in ("meshdir", "texturedir"):  # as seen from `out`
+    spec.modelfiledir = str(out.resolve().parent)
+    for key in ("meshdir", "texturedir"):
         folder = model_of(path).parent / getattr(spec, key)
-        setattr(spec, key, os.path.relpath(folder, out.resolve().parent))
+        setattr(spec, key, os.path.relpath(folder, spec.modelfiledir))
     try:
         text = spec.to_xml()
     except (ValueError, RuntimeError) as error:

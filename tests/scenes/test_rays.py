@@ -154,7 +154,7 @@ found["words"] = np.empty((len(points), 768), np.uint32)
 reader.words(given["keys"], np.uint64(7), steps, steps, found["words"])
 ranges = found["rays"].reshape(len(points), 768)
 found["readings"] = np.empty_like(ranges)
-read = given["scale"], given["inner"], found["words"], given["errors"], found["readings"]
+read = given["scale"], given["columns"].item(), found["words"], given["errors"], found["readings"]
 reader.readings(ranges, *read)
 np.savez(sys.argv[2], **found)
 """
@@ -182,7 +182,7 @@ def given_to_kernels() -> dict[str, Any]:
         "turns": dice.normal(size=(count, 4)),
         "keys": dice.integers(0, 2**32, (count, 2), dtype=np.uint32),
         "scale": np.full(768, 0.9, np.float32),
-        "inner": np.array([[1, *((np.arange(768) + 1) % 32 > 0)]], np.int32),
+        "columns": np.array(32),
         "errors": ERRORS.numbers(),
     }
 
@@ -209,7 +209,13 @@ def found_by_numpy(given: dict[str, Any], cast: Any) -> dict[str, np.ndarray]:
     found["words"] = words_of(given["keys"], 7, steps, steps, 768)
     ranges = found["rays"].reshape(count, 768)
     found["readings"] = np.empty_like(ranges)
-    read = given["scale"], given["inner"], found["words"], given["errors"], found["readings"]
+    read = (
+        given["scale"],
+        given["columns"].item(),
+        found["words"],
+        given["errors"],
+        found["readings"],
+    )
     returns.by_numpy(ranges, *read)
     return found
 
