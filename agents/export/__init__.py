@@ -58,7 +58,7 @@ def finite_policy(checkpoint: Checkpoint) -> NetworkPolicy:
     """The policy. Raises `InputError` for one that diverged."""
     policy = checkpoint.policy()
     largest = np.abs(policy.weights.values).max()
-    if largest > _LARGEST:
+    if not largest <= _LARGEST:  # nan is not
         raise InputError(
             f"policy: expected weights of at most {_LARGEST:g}, got {largest:g}: training diverged"
         )

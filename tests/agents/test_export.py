@@ -495,6 +495,9 @@ def test_a_policy_that_diverged_is_refused(target: str, trained: Path) -> None:
         InputError, match=r"^policy: expected weights of at most 1e\+06, got 3e\+38"
     ):
         export(replace(kept, actor=actor), target)
+    actor["layers.0.weight"][0] = np.nan
+    with pytest.raises(InputError, match="got nan: training diverged"):
+        export(replace(kept, actor=actor), target)
 
 
 def test_only_onnx_needs_onnx(trained: Path, tmp_path: Path) -> None:
