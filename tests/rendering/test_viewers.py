@@ -18,23 +18,29 @@ stage, pace = Stage("plain", 2), Pace(0.02)
 live = LiveView(stage, pace)
 for step in range(20):
     height = 5.0 + step / 20
-    live.draw(*[
+    moments = [
         Moment(position=(0.0, 0.0, height), attitude=(1.0, 0.0, 0.0, 0.0), thrusts=(49.0,) * 4,
                goal=(0.0, 0.0, 5.0), step=step)
-    ] * 2)
+    ] * 2
+    live.draw(*moments)
     time.sleep(0.05)
 end = time.monotonic() + 60
+for _ in range(2):  # when it takes them up again, they are drawn
+    while not live.wants and time.monotonic() < end:
+        time.sleep(0.05)
+    live.draw(*moments)
 while not live.wants and time.monotonic() < end:
     time.sleep(0.05)
 assert live.is_running
 surface = live._window
 handle = surface._handle
 assert abs(stage.data.qpos[2] - 5.95) < 1e-9, stage.data.qpos
-assert handle.cam.lookat[2] == 5.0
-discs = [g for g in handle.user_scn.geoms[:handle.user_scn.ngeom]
-         if g.type == mujoco.mjtGeom.mjGEOM_CYLINDER]
-assert [round(float(g.pos[2]), 6) for g in discs] == [5.0, 5.0], discs
-assert handle.user_scn.ngeom > 2  # and pieces of paths
+with handle.lock():
+    assert handle.cam.lookat[2] == 5.0
+    discs = [g for g in handle.user_scn.geoms[:handle.user_scn.ngeom]
+             if g.type == mujoco.mjtGeom.mjGEOM_CYLINDER]
+    assert [round(float(g.pos[2]), 6) for g in discs] == [5.0, 5.0], discs
+    assert handle.user_scn.ngeom > 2  # and pieces of paths
 for key in (32, 262, 340):  # space, arrow, shift
     surface._on_key(key)
 assert (pace.paused, pace.wait(0.0)) == (True, 0.0)
