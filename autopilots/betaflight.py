@@ -99,8 +99,8 @@ def configuration(
 
 
 def new_program(lockstep: bool, alone: int = 2) -> tuple[Program, dict[str, str]]:
-    """A program that may run, and its environment. In lock-step it has ports of its own, and its
-    clock runs `alone` for so many s, as fast as it can, before it waits for the first state.
+    """A program that may run, and its environment. In lock-step it has ports of its own. Its clock
+    first runs by itself for `alone` s, as fast as it can; then it waits for the first state.
     """
     ports = (protocol.STATE_PORT, protocol.STICKS_PORT)
     program = Program("betaflight", protocol.MOTORS_PORT, ports, APART if lockstep else 0)
@@ -122,11 +122,11 @@ def _connected(port: int, deadline: float) -> socket.socket:
 
 
 def _told(link: socket.socket, *commands: str, end: str = _PROMPT) -> str:
-    """The answer of its CLI to commands, a prompt for each of them."""
+    """The answer of its CLI to commands: it echoes each, and ends with a prompt."""
     link.sendall("".join(f"{command}\r\n" for command in commands).encode())
     answer = ""
     deadline = time.monotonic() + ANSWER
-    while not answer.endswith(end) or answer.count(end) < len(commands):
+    while not answer.endswith(end) or commands[-1] not in answer:
         if time.monotonic() > deadline:
             raise TimeoutError(f"no end of its answer to {commands[-1]!r}")
         try:

@@ -80,7 +80,7 @@ class Crazyflie(Stack):
     def __init__(self, start: Start) -> None:
         config, vehicle, mode, path, real_time, _ = start
         corners = np.sign([rotor.position[:2] for rotor in vehicle.rotors]).tolist()
-        if corners != [*map(list, MOTORS)]:
+        if not np.array_equal(corners, MOTORS):
             raise InputError(
                 "crazyflie: expected four rotors, clockwise from the front right, "
                 f"got {vehicle.name} with rotors at {corners}"

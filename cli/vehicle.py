@@ -66,7 +66,8 @@ class Vehicle(Command):
         """Do it."""
         if (self.action == "export") != bool(self.out):
             raise InputError(
-                f"vehicle: expected OUT.xml with export alone, got {self.action} and {self.out}"
+                "vehicle: expected OUT.xml with export and with nothing else, "
+                f"got {self.action} with {self.out or 'none'}"
             )
         if "frame" in self.given and self.action != "new":
             raise InputError(f"frame: expected no --frame but with new, got {self.frame}")

@@ -36,8 +36,8 @@ class Told(NamedTuple):
     moment: Any
 
     def __call__(self) -> Content:
-        read = self.read((self.moment,))
-        telemetry, terms = ({name: x[0] for name, x in part.items()} for part in read)
+        content = self.read((self.moment,))
+        telemetry, terms = ({name: x[0] for name, x in part.items()} for part in content)
         return telemetry, terms
 
 

@@ -7,7 +7,7 @@ from .stage import Moment, range_colors
 
 _SHARE = 0.4  # of a picture's width and height, at most
 _GAP = 6  # pixels about an inset
-_LEAST = 16  # pixels: of its height
+_LEAST = 16  # pixels of its height, at least
 
 
 def add_insets(picture: Picture, moment: Moment) -> None:

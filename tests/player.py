@@ -58,10 +58,10 @@ def answer_cli(listening):
                 command = line.strip()
                 if command == b"save":
                     Path("eeprom.bin").write_bytes(b"configured")
-                    link.sendall(b"Rebooting")
+                    link.sendall(line + b"Rebooting")
                     break
                 said = RELEASE % b"2026.12.0" if command == b"version" else b""
-                link.sendall(said + b"# ")
+                link.sendall(line + said + b"# ")
 
 
 def play(session, ports, there):
