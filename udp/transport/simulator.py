@@ -321,6 +321,8 @@ def _free_running(
     if len(links) > 1 or links[0].client.by_text:
         raise InputError("free_run: expected one agent and binary messages")
     failsafe = None
+    if isinstance(stepped, Loop):
+        stepped.prepare()  # before the clock runs
     if run.after != "hold":
         if not isinstance(stepped, Loop):
             raise InputError(f"after: expected hold with {stepped.spec.env_id}, got {run.after}")

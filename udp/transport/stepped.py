@@ -54,9 +54,7 @@ def make_stepped(
         raise InputError(f"drones: expected a divisor of num_envs = {count}, got {drones}")
     from ...envs.compiled import make_loop
 
-    loop = make_loop(config, count // drones)
-    loop.prepare()
-    return loop
+    return make_loop(config, count // drones)
 
 
 class GymnasiumWorld:
