@@ -33,6 +33,10 @@ APART = 10
 MOST_MOTORS = 8
 AT_ONCE = 8
 """Commands that its CLI is given together: they and the answers fit into its buffers."""
+STARTS = 5
+"""Of a program until its CLI answers."""
+ENTRY = 1.0
+"""Longest time until its CLI takes commands, s."""
 FOREVER = 10**6
 """Longer than a program is configured, s of its clock."""
 _PROMPT = "# "
@@ -121,11 +125,11 @@ def _connected(port: int, deadline: float) -> socket.socket:
             time.sleep(0.01)
 
 
-def _told(link: socket.socket, *commands: str, end: str = _PROMPT) -> str:
+def _told(link: socket.socket, *commands: str, end: str = _PROMPT, within: float = ANSWER) -> str:
     """The answer of its CLI to commands: it echoes each, and ends with a prompt."""
     link.sendall("".join(f"{command}\r\n" for command in commands).encode())
     answer = ""
-    deadline = time.monotonic() + ANSWER
+    deadline = time.monotonic() + within
     while not answer.endswith(end) or commands[-1] not in answer:
         if time.monotonic() > deadline:
             raise TimeoutError(f"no end of its answer to {commands[-1]!r}")
@@ -147,10 +151,10 @@ def _told(link: socket.socket, *commands: str, end: str = _PROMPT) -> str:
 
 @cache
 def configured(
-    path: Path | None, commands: tuple[str, ...], lockstep: bool
+    path: Path | None, commands: tuple[str, ...], lockstep: bool, starts: int = STARTS
 ) -> tuple[tuple[int, int], bytes]:
     """A program's release, year and month, and its memory after commands of its CLI. It runs once
-    for this.
+    for this, or anew: where its start is slow, a thread of it may drop the CLI's port.
 
     Raises `InputError`, or `PeerSilent`.
     """
@@ -160,7 +164,8 @@ def configured(
         deadline = time.monotonic() + ANSWER if path else math.inf
         try:
             with _connected(protocol.CLI_PORT + program.moved, deadline) as link:
-                _told(link, "#")  # it wants silence behind this, 0.1 s of its clock
+                # It wants silence behind this, 0.1 s of its clock.
+                _told(link, "#", within=ENTRY)
                 link.settimeout(0.05)
                 version = protocol.version_of(_told(link, "version"))
                 for first in range(0, len(commands), AT_ONCE):
@@ -168,7 +173,9 @@ def configured(
                 _told(link, "save", end="Rebooting")
             return version, (program.folder / _MEMORY).read_bytes()
         except OSError as error:
-            raise program.silent(f"its CLI, got none: {error}") from None
+            if path is None or starts == 1 or not isinstance(error, TimeoutError):
+                raise program.silent(f"its CLI, got none: {error}") from None
+    return configured(path, commands, lockstep, starts - 1)
 
 
 class Betaflight(Stack):

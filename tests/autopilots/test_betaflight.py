@@ -6,6 +6,7 @@ Each may be of another release.
 import math
 import os
 import re
+import shutil
 import signal
 import subprocess
 import sys
@@ -42,6 +43,20 @@ link = socket.create_server(("127.0.0.1", port)).accept()[0]
 while True:
     link.sendall(b"no end ")
     time.sleep(0.01)
+"""
+LISTENS_LATER = f"""
+import os, signal, socket, sys
+from pathlib import Path
+sys.path.append({str(Path(__file__).parents[1])!r})
+from player import answer_cli
+started = Path(__file__).with_name("started")
+port = 5761 + int(os.environ.get("BETAFLIGHT_APART", 0))
+with socket.create_server(("127.0.0.1", port)) as listening:
+    with started.open("a") as file:
+        file.write("once ")
+    if len(started.read_text().split()) < 3:
+        signal.pause()
+    answer_cli(listening)
 """
 
 
@@ -148,7 +163,7 @@ def test_one_that_ends_before_its_cli_says_what_it_said(
 def test_a_cli_that_never_ends_its_answer_is_given_up(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("rotorgram.autopilots.betaflight.ANSWER", 1.0)
+    monkeypatch.setattr("rotorgram.autopilots.betaflight.ENTRY", 0.1)
     program = tmp_path / "talks"
     write_program(program, TALKS)
     config = config_of()
@@ -156,6 +171,19 @@ def test_a_cli_that_never_ends_its_answer_is_given_up(
     sentence = r"^betaflight: expected its CLI, got none: no end of its answer to '#'$"
     with pytest.raises(PeerSilent, match=sentence):
         STACK.make(start)
+
+
+@pytest.mark.skipif(shutil.which("cc") is None, reason="expected a C compiler, got none")
+def test_one_whose_cli_hears_nobody_is_started_anew(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("rotorgram.autopilots.betaflight.ENTRY", 0.1)
+    program = tmp_path / "later"
+    write_program(program, LISTENS_LATER)
+    before = children()
+    assert configured(program, ("set small_angle = 180",), True) == ((2026, 12), b"configured")
+    assert (tmp_path / "started").read_text().split() == ["once"] * 3
+    assert children() == before
 
 
 @needs_program
