@@ -28,6 +28,8 @@
 #include <time.h>
 #include <unistd.h>
 
+#include "watch.h"
+
 enum { MOTORS = 9001, SERVOS = 9002, STICKS = 9004, STATE_SIZE = 18 * 8, MOTORS_SIZE = 68 };
 static const int64_t SECOND = 1000000000, TICK = 1000; /* ns */
 
@@ -184,6 +186,7 @@ int select(int count, fd_set *reads, fd_set *writes, fd_set *errors, struct time
     if (stamp >= 0.0) { /* it has taken over the last state */
         go_on_to(stamp);
         stamp = -1.0;
+        watch(count - 1);
     }
     return (int)syscall(SYS_select, count, reads, writes, errors, timeout);
 }

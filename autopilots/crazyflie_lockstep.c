@@ -28,6 +28,8 @@
 #include <time.h>
 #include <unistd.h>
 
+#include "watch.h"
+
 enum { SIMULATED = 0x90, MASK = 0xF3, MOTORS_SIZE = 9, SLOTS = 64, SIZE = 64 };
 static const long SECOND = 1000000000, TICK = 1000000; /* ns */
 
@@ -79,6 +81,7 @@ static void collect(void)
         char datagram[SIZE];
         struct sockaddr_in from;
         socklen_t length = sizeof from;
+        watch(link_socket);
         ssize_t got = receive(link_socket, datagram, SIZE, 0, (struct sockaddr *)&from, &length);
         if (got < 0 && errno != EINTR)
             _exit(1);

@@ -2,11 +2,11 @@
 
 import math
 import os
+import select
 import shlex
 import shutil
 import socket
 import subprocess
-import threading
 import time
 import weakref
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -24,6 +24,10 @@ ANSWER = 5.0
 """Longest time for an answer, s."""
 _MOST = 16
 """Of one kind that run side by side."""
+WATCH = 0.001
+"""Time for which this thread watches for an answer, s, before it sleeps until one comes."""
+REST = 0.1
+"""Time without watching after that, s: others may want the core."""
 _BEHIND = 0.005  # s: a longer delay of real time is not made up for
 _LOG = "output.txt"
 
@@ -54,7 +58,7 @@ class Program:
         self.folder = Path(self._closing.enter_context(TemporaryDirectory(prefix="rotorgram-")))
         self._process: subprocess.Popen[bytes] | None = None
         self._there: tuple[str, int] | None = None  # from where it sends
-        self.sent_at = math.inf
+        self.sent_at = self._watch_from = math.inf
         self._period: float | None = None
         self._due = self._heard = 0.0
         last = (_MOST - 1) * apart
@@ -79,8 +83,8 @@ class Program:
         """Run it in the folder, its output in a file there. Without a program, say how the user
         starts it, and wait for it.
 
-        With a period of its steps, s, it keeps its own clock. Without one it runs on one core with
-        this thread: they take turns, and a core that slept would wake late for each turn.
+        With a period of its steps, s, it keeps its own clock. Without one it gets a core of its
+        own, and this thread watches for its answers: who sleeps wakes late for each turn.
         """
         self._period = period
         if program is None:
@@ -94,8 +98,6 @@ class Program:
             raise InputError(f"program: expected one that can be run, got {program}")
         if shutil.which("setpriv"):  # it is killed even if this process is
             command = ["setpriv", "--pdeathsig", "KILL", *command]
-        if period is None:
-            self._keep_one_core()
         log = self._closing.enter_context((self.folder / _LOG).open("wb"))
         self._process = subprocess.Popen(
             command,
@@ -106,18 +108,18 @@ class Program:
             stderr=subprocess.STDOUT,
             process_group=0,
         )
+        if period is None:
+            self._give_core(self._process.pid)
         self._closing.enter_context(self._process)  # waits for its end
         self._closing.callback(self._process.kill)  # while it waits it takes no other signal
 
-    def _keep_one_core(self) -> None:
-        """Keep this thread, and what it starts, on one core until the end, where the system can."""
-        thread = threading.get_native_id()  # another one may end this
-        with suppress(OSError, AttributeError):
-            cores = os.sched_getaffinity(thread)
-            if len(cores) > 1:
-                os.sched_setaffinity(thread, {sorted(cores)[os.getpid() % len(cores)]})
-                self._closing.enter_context(suppress(OSError))  # the thread may have ended
-                self._closing.callback(os.sched_setaffinity, thread, cores)
+    def _give_core(self, process: int) -> None:
+        with suppress(OSError, AttributeError):  # a system where cores cannot be chosen
+            cores = sorted(os.sched_getaffinity(0))
+            if others := len(cores) - 1:
+                core = os.getpid() + self.moved % others
+                os.sched_setaffinity(process, {cores[core % len(cores)]})
+                self._watch_from = 0.0
 
     def listen(self, port: int) -> socket.socket:
         """A socket that gets what the program sends there. It does not wait."""
@@ -136,13 +138,18 @@ class Program:
         answer for too long, `PeerClosed` if it has ended.
         """
         where = where or self.link
-        if where.gettimeout() != wait:  # a call of the system
-            where.settimeout(wait)
-        with suppress(TimeoutError, ConnectionRefusedError):
-            while time.monotonic() < self.sent_at + ANSWER:
-                datagram, sender = where.recvfrom(2048)
-                if where is not self.link or sender == self._there:
-                    return datagram
+        with suppress(ConnectionRefusedError):
+            while (now := time.monotonic()) < self.sent_at + ANSWER:
+                try:
+                    datagram, sender = where.recvfrom(2048, socket.MSG_DONTWAIT)
+                    if where is not self.link or sender == self._there:
+                        return datagram
+                except BlockingIOError:
+                    watches = max(self._watch_from, self.sent_at) <= now < self.sent_at + WATCH
+                    if self._watch_from <= now and not watches:
+                        self._watch_from = now + REST
+                    if not (watches or select.select([where], [], [], wait)[0]):
+                        break
         raise self.silent(f"an answer within {wait:g} s, got none")
 
     def meet(self, read: Callable[[bytes], object]) -> bytes:
