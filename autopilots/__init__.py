@@ -1,10 +1,11 @@
 """Flight stacks of others as agents: their bytes, their programs, and the seat that they take."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Sequence
 from importlib import import_module
 from typing import TYPE_CHECKING, NamedTuple
 
 from ..models.errors import InputError
+from ..models.files import read_own_toml
 
 if TYPE_CHECKING:
     from .seat import Stack, Start
@@ -18,9 +19,9 @@ class StackInfo(NamedTuple):
     """Name of its class, in the module of its name."""
     rate: float
     """Of its steps, Hz."""
-    modes: tuple[str, ...]
+    modes: Sequence[str]
     """Ways to fly; the first one unless told otherwise."""
-    takes: tuple[str, ...] = ()
+    takes: Sequence[str] = ()
     """Fields of `Start` that other stacks do not take."""
 
     def check(self, start: "Start") -> None:
@@ -41,23 +42,7 @@ class StackInfo(NamedTuple):
         return kind(start)
 
 
-STACKS: Mapping[str, StackInfo] = {
-    one.name: one
-    for one in (
-        StackInfo("ardupilot", "ArduPilot", 400.0, ("guided", "auto")),
-        StackInfo(
-            "betaflight", "Betaflight", 1000.0, ("angle", "acro"), takes=("real_time", "policy")
-        ),
-        StackInfo(
-            "crazyflie",
-            "Crazyflie",
-            1000.0,
-            ("auto", "pid", "mellinger", "indi", "brescianini", "policy"),
-            takes=("real_time",),
-        ),
-        StackInfo("px4", "Px4", 250.0, ("offboard",)),
-    )
-}
+STACKS = {name: StackInfo(name, **row) for name, row in read_own_toml(__file__, "stacks").items()}
 
 
 def find_stack(name: str) -> StackInfo:

@@ -63,7 +63,7 @@ class Sensing(Stage):
         flown = record.flown
         if flown is None:
             flown = np.ones(record.shape, bool)
-        self.sensors.sample(flown)
+        self.sensors.sample(flown, record.steps)
         if self.replaces:
             seen = self.sensors.seen()
             values = {name: read_only(getattr(seen, name)) for name in _ESTIMATED}

@@ -2,20 +2,15 @@
 
 import numpy as np
 
+from ...models.files import read_own_toml
 from ...sim import Array, length
 from ..spec import Metric
 from ..state import State
 from .goal import FLIGHT_TIME
 from .task import Task
 
-METRICS = (
-    Metric(name="success", unit="", goal="high", held=0.5, final=True),
-    Metric(name="touched", unit="", final=True),
-    Metric(name="mean_speed", unit="m/s", goal="high", final=True),
-    Metric(name="top_speed", unit="m/s", goal="high", final=True),
-    Metric(name="least_clearance", unit="m", goal="high", final=True),
-    FLIGHT_TIME,
-)
+_OWN = read_own_toml(__file__, "measures").items()
+METRICS = (*[Metric(name=name, final=True, **row) for name, row in _OWN], FLIGHT_TIME)
 
 
 def begin_measures(task: Task) -> None:

@@ -14,7 +14,7 @@ from ... import models
 from ...models.errors import InputError
 from ...models.fields import Choice, Flag, check, check_names, mapping
 from ..snapshots import Kept
-from ..state import Array, ByName, WorldState, chosen
+from ..state import Array, ByName, WorldState
 from ..world import World
 from . import range_sensors
 from .barometer import Barometer
@@ -121,8 +121,6 @@ class Sensors(Kept):
     Raises `InputError`.
     """
 
-    arrays = ("_steps",)
-
     def __init__(self, sensors: Values, world: World, period: float) -> None:
         self._world = world
         settings = _resolved(sensors, world.vehicle, period)
@@ -133,21 +131,20 @@ class Sensors(Kept):
             name: SENSOR_TYPES[name](values, period, world) for name, values in settings.items()
         }
         self._replaces = "observe" in sensors
-        self._steps: Array = 0
 
     def begin(self, mask: Array) -> None:
         """Begin episodes of the drones of a mask, bool, shape (W, A), after a reset of theirs."""
-        self._steps = chosen(mask, 0 * mask, self._steps)
         for sensor in self._sensors.values():
             sensor.begin(mask)
         if self._estimator is not None:
             self._estimator.begin(mask, self._world.state, self._sensors["imu"].value)
 
-    def sample(self, mask: Array) -> None:
-        """After a control step of the drones of a mask; the others keep their readings."""
-        self._steps = self._steps + mask
+    def sample(self, mask: Array, steps: Array) -> None:
+        """After a control step of the drones of a mask; the others keep their readings. `steps`
+        counts those of each episode, shape (W, A).
+        """
         for sensor in self._sensors.values():
-            sensor.sample(mask, self._steps)
+            sensor.sample(mask, steps)
         if self._estimator is not None:
             self._estimator.update(mask, self._sensors)
 

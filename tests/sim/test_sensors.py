@@ -92,7 +92,7 @@ def test_imu_of_a_craft_that_stands() -> None:
     world, sensors, every = sensing({"imu": IMU}, position=(0.0, 0.0, 0.4), thrust=[0.0] * 4)
     for _ in range(100):  # until it has come to rest
         world.step(np.zeros(4), 2)
-    sensors.sample(every)
+    sensors.sample(every, 1)
     expected = (0, 0, 0, 0, 0, 9.8)
     assert sensors.readings["imu"][0, 0] == approx(expected, abs=1e-3)
 
@@ -101,7 +101,7 @@ def test_imu_at_the_end_of_a_step() -> None:
     """A tumbling craft: the force is that of the last thrusts, in the body's axes of the end."""
     world, sensors, every = sensing({"imu": IMU}, body_rates=(1.0, 2.0, 0.5))
     world.step(np.array((60.0, 50.0, 40.0, 30.0)), 2)
-    sensors.sample(every)
+    sensors.sample(every, 1)
     reading = sensors.readings["imu"][0, 0]
     expected = (0.0, 0.0, 180.0 / 20.0)
     assert reading[3:] == approx(expected, abs=1e-9)
@@ -126,7 +126,7 @@ def test_imu_feels_the_air(tmp_path: Path) -> None:
     begin(world, position=(0.0, 0.0, 5.0))
     sensors.begin(EVERY)
     world.step(vehicle.hover_thrust, 1)
-    sensors.sample(EVERY)
+    sensors.sample(EVERY, 1)
     expected = (0.5, 0.0, 9.8)
     found = sensors.readings["imu"][0, 0, 3:]
     assert found == approx(expected, abs=1e-3)
@@ -149,7 +149,7 @@ def test_imu_bias() -> None:
     assert bias.std() == approx(0.1, abs=4 * 0.1 / sqrt(2 * 9000))
     assert off.std() == approx(0.02, abs=4 * 0.02 / sqrt(2 * 3000))
     assert abs(bias.mean()) < 4 * 0.1 / sqrt(9000)
-    sensors.sample(every)
+    sensors.sample(every, 1)
     found = sensors.readings["imu"][:, 0, :3]
     assert_allclose(found, bias, atol=1e-15)
     some = np.arange(3000)[:, None] < 10
@@ -179,7 +179,7 @@ def test_barometer_walks() -> None:
     found = sensors.readings["barometer"].ravel()
     assert found == approx([5.0] * 2000)
     for _ in range(200):
-        sensors.sample(every)
+        sensors.sample(every, 1)
     pressure = isa_pressure(sensors.readings["barometer"].ravel()) - isa_pressure(5.0)
     # The bias of a reading is that before its own step of the walk.
     expected = 0.5 * sqrt(200 * PERIOD)
@@ -256,9 +256,10 @@ def test_allan_deviation_of_the_gyroscope(rate: float) -> None:
     _, sensors, every = sensing({"imu": settings}, worlds)
     interval = 1 / rate
     series = []
-    for _ in range(samples):
-        for _ in range(round(interval / PERIOD)):
-            sensors.sample(every)
+    every_th = round(interval / PERIOD)
+    for sample in range(samples):
+        for step in range(1, every_th + 1):
+            sensors.sample(every, sample * every_th + step)
         series.append(sensors.readings["imu"][:, 0, :3].ravel())
     rates = np.array(series)
     found = {}
@@ -283,9 +284,9 @@ def test_a_delay_is_exact_and_a_rate_holds(worlds: int) -> None:
     world, sensors, every = sensing({"gps": settings}, worlds, velocity=(1.0, 2.0, 3.0))
     flown = [world.state.position.copy()]
     told = [sensors.readings["gps"][..., :3]]
-    for _ in range(20):
+    for step in range(1, 21):
         world.step(np.full((*world.shape, 4), 60.0), 2)
-        sensors.sample(every)
+        sensors.sample(every, step)
         flown.append(world.state.position.copy())
         told.append(sensors.readings["gps"][..., :3])
     of_step = [0, 0, 0, 0, 0, 0, 0, 0, 5, 5, 5, 5, 5, 10, 10, 10, 10, 10, 15, 15, 15]
@@ -300,7 +301,7 @@ def test_dropouts() -> None:
     lost = 0
     before = sensors.readings["gps"]
     for _ in range(50):
-        sensors.sample(every)
+        sensors.sample(every, 1)
         now = sensors.readings["gps"]
         same = (now == before).all(axis=-1)
         assert (same == (now == before).any(axis=-1)).all()
@@ -378,7 +379,7 @@ def test_contacts_are_the_same_with_an_imu() -> None:
         world, made, every = sensing(sensors, 2, position=(0.0, 0.0, 0.45), body_rates=(1, 0.5, 0))
         for _ in range(100):
             world.step(np.full((2, 1, 4), 20.0), 2)
-            made.sample(every)
+            made.sample(every, 1)
         assert world.state.touching.all()
         states.append(world.state.position.tobytes() + world.state.velocity.tobytes())
     assert states[0] == states[1]
@@ -485,7 +486,7 @@ def test_errors_of_a_long_hover_are_those_of_the_biases() -> None:
     sensors = {"imu": biases, "barometer": {"noise": 0.0}, "estimate": True}
     _, made, every = sensing(sensors, drones)
     for _ in range(600):  # 12 s: a filter of 1 s has settled
-        made.sample(every)
+        made.sample(every, 1)
     estimate = made.readings["estimate"][:, 0]
     turned = 2 * estimate[:, 7:10]  # small angles, about x, y, z
     pole = exp(-PERIOD)
@@ -506,7 +507,7 @@ def test_an_exact_estimate_of_a_steady_climb() -> None:
     world, made, every = sensing({**sensors, "estimate": True}, velocity=(1.0, -2.0, 0.0))
     for _ in range(100):
         world.step(np.full(4, 55.0), 2)
-        made.sample(every)
+        made.sample(every, 1)
     estimate = made.readings["estimate"][0, 0]
     expected = alone(world).position.tolist()
     assert estimate[:3] == approx(expected, abs=1e-9)
