@@ -37,8 +37,8 @@ class StackInfo(NamedTuple):
     def make(self, start: "Start") -> "Stack":
         """Begin one. Raises `InputError` where that fails."""
         self.check(start)
-        kind: Callable[[Start], Stack]
-        kind = getattr(import_module(f".{self.name}", __name__), self.kind)
+        module = import_module(f".{self.name}", __name__)
+        kind: Callable[[Start], Stack] = getattr(module, self.kind)
         return kind(start)
 
 

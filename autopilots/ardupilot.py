@@ -116,8 +116,8 @@ class ArduPilot(Stack):
         frame_class, frame_type, self._order = motor_order(vehicle)
         values = _TABLES["parameters"] | tuning(vehicle, Propellers(config, vehicle))
         values |= {"FRAME_CLASS": frame_class, "FRAME_TYPE": frame_type}
-        if "rangefinder" in config.sensors:
-            values["RNGFND1_TYPE"] = 100
+        for sensor in config.sensors:
+            values |= _TABLES["sensors"].get(sensor, {})
         self._origin: Floats | None = None
         self._optional: dict[str, object] = {}
         if any(config.effects.wind):
@@ -157,6 +157,8 @@ class ArduPilot(Stack):
                 self._talk_of(order, self._origin)
         if "rangefinder" in observation:
             self._optional["rng_1"] = observation["rangefinder"].item()
+        if "battery" in observation:
+            self._optional["battery"] = {"voltage": observation["battery"].item()}
         self._program.send(protocol.state_line(reading, self._optional))
 
     def _read(self, datagram: bytes) -> Floats | None:

@@ -35,8 +35,8 @@ AT_ONCE = 8
 """Commands that its CLI is given together: they and the answers fit into its buffers."""
 STARTS = 5
 """Of a program until its CLI answers."""
-ENTRY = 1.0
-"""Longest time until its CLI takes commands, s."""
+CLI_ANSWER = 1.5
+"""Longest time for an answer of its CLI, s."""
 FOREVER = 10**6
 """Longer than a program is configured, s of its clock."""
 _PROMPT = "# "
@@ -125,11 +125,11 @@ def _connected(port: int, deadline: float) -> socket.socket:
             time.sleep(0.01)
 
 
-def _told(link: socket.socket, *commands: str, end: str = _PROMPT, within: float = ANSWER) -> str:
+def _told(link: socket.socket, *commands: str, end: str = _PROMPT) -> str:
     """The answer of its CLI to commands: it echoes each, and ends with a prompt."""
     link.sendall("".join(f"{command}\r\n" for command in commands).encode())
     answer = ""
-    deadline = time.monotonic() + within
+    deadline = time.monotonic() + CLI_ANSWER
     while not answer.endswith(end) or commands[-1] not in answer:
         if time.monotonic() > deadline:
             raise TimeoutError(f"no end of its answer to {commands[-1]!r}")
@@ -164,8 +164,7 @@ def configured(
         deadline = time.monotonic() + ANSWER if path else math.inf
         try:
             with _connected(protocol.CLI_PORT + program.moved, deadline) as link:
-                # It wants silence behind this, 0.1 s of its clock.
-                _told(link, "#", within=ENTRY)
+                _told(link, "#")  # it wants silence behind this, 0.1 s of its clock
                 link.settimeout(0.05)
                 version = protocol.version_of(_told(link, "version"))
                 for first in range(0, len(commands), AT_ONCE):

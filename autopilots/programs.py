@@ -109,17 +109,13 @@ class Program:
             process_group=0,
         )
         if period is None:
-            self._give_core(self._process.pid)
+            with suppress(OSError, AttributeError):  # a system where cores cannot be chosen
+                if others := sorted(os.sched_getaffinity(0))[1:]:
+                    core = others[(os.getpid() + self.moved) % len(others)]
+                    os.sched_setaffinity(self._process.pid, {core})
+                    self._watch_from = 0.0
         self._closing.enter_context(self._process)  # waits for its end
         self._closing.callback(self._process.kill)  # while it waits it takes no other signal
-
-    def _give_core(self, process: int) -> None:
-        with suppress(OSError, AttributeError):  # a system where cores cannot be chosen
-            cores = sorted(os.sched_getaffinity(0))
-            if others := len(cores) - 1:
-                core = os.getpid() + self.moved % others
-                os.sched_setaffinity(process, {cores[core % len(cores)]})
-                self._watch_from = 0.0
 
     def listen(self, port: int) -> socket.socket:
         """A socket that gets what the program sends there. It does not wait."""
@@ -145,10 +141,11 @@ class Program:
                     if where is not self.link or sender == self._there:
                         return datagram
                 except BlockingIOError:
-                    watches = max(self._watch_from, self.sent_at) <= now < self.sent_at + WATCH
-                    if self._watch_from <= now and not watches:
+                    if self._watch_from <= now:
+                        if self.sent_at <= now < self.sent_at + WATCH:
+                            continue
                         self._watch_from = now + REST
-                    if not (watches or select.select([where], [], [], wait)[0]):
+                    if not select.select([where], [], [], wait)[0]:
                         break
         raise self.silent(f"an answer within {wait:g} s, got none")
 

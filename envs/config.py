@@ -167,6 +167,8 @@ class EnvConfig:
             set_fields(self, sensors=checked_sensors(self.sensors))
         if not isinstance(self.effects, EffectOptions):
             set_fields(self, effects=read_table(EffectOptions, self.effects, "effects"))
+        if "battery" in self.sensors and not self.effects.battery:
+            raise InputError("sensors.battery: expected the effect battery, got none")
         options: Options = mapping(self.task, "task", "options by name")
         usual = SceneConfig()
         if task:

@@ -10,11 +10,11 @@ from .. import import_when_used
 from .errors import InputError, MissingPackage
 
 if TYPE_CHECKING:
-    from .vehicle import Rotor, Vehicle
+    from .vehicle import Vehicle
 
 __all__ = [
     "BACKENDS", "MAX_DRAG", "MAX_DRONES", "QUAD_XML", "Backend", "InputError", "MissingPackage",
-    "Rotor", "Vehicle",
+    "Vehicle",
 ]  # fmt: skip
 
 QUAD_XML = Path(__file__).parent / "quad.xml"

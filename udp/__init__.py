@@ -10,16 +10,13 @@ from .. import import_when_used
 
 if TYPE_CHECKING:
     from ..envs.autoreset import LOST
-    from .protocol.client import Address, LinkConfig
+    from .protocol.client import LinkConfig
     from .protocol.errors import DecodeError, LinkError, PeerClosed, PeerSilent, Refused
     from .remote import RemoteEnv, RemoteVectorEnv
-    from .transport.simulator import DEFAULT_AGENT, DEFAULT_SIMULATOR, Simulator
+    from .transport.simulator import Simulator
 
 __all__ = [
-    "DEFAULT_AGENT",
-    "DEFAULT_SIMULATOR",
     "LOST",
-    "Address",
     "DecodeError",
     "LinkConfig",
     "LinkError",

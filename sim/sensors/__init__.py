@@ -21,11 +21,11 @@ from .barometer import Barometer
 from .base import Sensor, Source, Values, checked_settings
 from .estimator import Estimator
 from .imu import Imu
-from .simple import Gps, Magnetometer, MotionCapture, Rangefinder
+from .simple import Battery, Gps, Magnetometer, MotionCapture, Rangefinder
 
 SENSOR_TYPES: Mapping[str, type[Sensor]] = {
     kind.about.name: kind
-    for kind in (Imu, Magnetometer, Barometer, Rangefinder, Gps, MotionCapture)
+    for kind in (Imu, Magnetometer, Barometer, Rangefinder, Gps, MotionCapture, Battery)
 }
 """In this order they are observed."""
 

@@ -1,4 +1,4 @@
-"""Sensors with white noise alone: magnetometer, rangefinder, GPS, motion capture."""
+"""Sensors with white noise alone: magnetometer, rangefinder, GPS, motion capture, battery."""
 
 import numpy as np
 
@@ -58,3 +58,12 @@ class MotionCapture(Sensor):
         position = state.position + self.values["noise"] * normal[..., :3]
         turned = advanced(state.quaternion, self.values["angle_noise"] * normal[..., 3:])
         return np.concat((position, turned), axis=-1)
+
+
+class Battery(Sensor):
+    """Voltage at the terminals of the battery, which the effect `battery` brings; white noise."""
+
+    about = ABOUT["battery"]
+
+    def measure(self, normal: Array) -> Array:
+        return stack((self.world.effects.rotors.voltage,)) + self.values["noise"] * normal

@@ -6,10 +6,12 @@ from collections.abc import Iterator
 from contextlib import closing
 from hashlib import blake2b
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from commands import write_program
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from rotorgram.autopilots.ardupilot import ArduPilot, motor_order, tuning
 from rotorgram.autopilots.reading import Order, Propellers, Reading
 from rotorgram.autopilots.seat import Seat, Start, seated
@@ -312,6 +314,34 @@ def test_holds_in_wind_and_gusts_with_a_rangefinder() -> None:
     keywords = {"effects": effects, "sensors": sensors}
     (flight,), _ = fly("rotorgram/Hover-v0", "hummingbird", **keywords)
     assert distance(flight)[-400:].max() < 0.3
+
+
+@needs_program
+def test_reads_the_voltage_of_the_battery(monkeypatch: pytest.MonkeyPatch) -> None:
+    voltages: list[float] = []
+    listen = ArduPilot._listen
+
+    def ask_and_listen(stack: ArduPilot) -> None:
+        status = mavlink.MAVLINK_MSG_ID_SYS_STATUS
+        if stack.ready:
+            stack._command(mavlink.MAV_CMD_REQUEST_MESSAGE, status)
+        listen(stack)
+
+    def parsed(link: mavlink.MAVLink, data: bytes) -> Any:
+        messages = parse(link, data) or []
+        reports = [one for one in messages if one.get_type() == "SYS_STATUS"]
+        voltages.extend(1e-3 * one.voltage_battery for one in reports)
+        return messages
+
+    parse = mavlink.MAVLink.parse_buffer
+    monkeypatch.setattr(ArduPilot, "_listen", ask_and_listen)
+    monkeypatch.setattr(mavlink.MAVLink, "parse_buffer", parsed)
+    keywords = {"effects": {"battery": True}, "sensors": {"battery": True}}
+    (flight,), _ = fly("rotorgram/Hover-v0", "heavy_hexa", **keywords)
+    flown = flight.telemetry["battery"][:, 1]
+    assert len(voltages) > 50
+    assert voltages[-1] == pytest.approx(flown[-1], abs=0.05)
+    assert max(voltages) > flown.max() - 0.05  # on its stand it had more
 
 
 @needs_program

@@ -163,7 +163,7 @@ def test_one_that_ends_before_its_cli_says_what_it_said(
 def test_a_cli_that_never_ends_its_answer_is_given_up(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("rotorgram.autopilots.betaflight.ENTRY", 0.1)
+    monkeypatch.setattr("rotorgram.autopilots.betaflight.CLI_ANSWER", 0.3)
     program = tmp_path / "talks"
     write_program(program, TALKS)
     config = config_of()
@@ -177,7 +177,7 @@ def test_a_cli_that_never_ends_its_answer_is_given_up(
 def test_one_whose_cli_hears_nobody_is_started_anew(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("rotorgram.autopilots.betaflight.ENTRY", 0.1)
+    monkeypatch.setattr("rotorgram.autopilots.betaflight.CLI_ANSWER", 0.3)
     program = tmp_path / "later"
     write_program(program, LISTENS_LATER)
     before = children()

@@ -274,6 +274,39 @@ def test_allan_deviation_of_the_gyroscope(rate: float) -> None:
     assert found[1024] == approx(walk * sqrt(1024 * interval / 3), rel=0.2)
 
 
+@pytest.mark.parametrize("backend", ["mujoco", "rigid"])
+def test_voltage_of_the_battery(backend: str) -> None:
+    """That of the terminals: it drops under load, and is noisy as it is told."""
+    keywords = {"vehicle": "heavy_hexa", "effects": {"battery": True}, "backend": backend}
+    sensors: dict[str, Any] = {"battery": {"rate": 25.0}}
+    loop = Loop(EnvConfig.from_keywords(HOVER, sensors=sensors, **keywords), 200)
+    noisy = Loop(
+        EnvConfig.from_keywords(HOVER, sensors={"battery": {"noise": 0.1}}, **keywords), 200
+    )
+    every = np.ones(200, bool)
+    actions = np.full((200, 6), 0.2, np.float32)
+    for one in (loop, noisy):
+        one.advance(actions, every, range(200))
+    told = [loop.observations["battery"].copy()]
+    exact = [loop.telemetry["battery"][:, 1:].copy()]
+    for _ in range(4):
+        for one in (loop, noisy):
+            one.advance(actions)
+        told.append(loop.observations["battery"].copy())
+        exact.append(loop.telemetry["battery"][:, 1:].copy())
+    for step, read in enumerate((0, 0, 2, 2, 4)):
+        assert_array_equal(told[step], exact[read].astype(np.float32))
+    assert (exact[4] < exact[1]).all()
+    off = noisy.observations["battery"] - noisy.telemetry["battery"][:, 1:]
+    assert off.std() == approx(0.1, abs=4 * 0.1 / sqrt(400))
+
+
+def test_a_voltage_needs_a_battery() -> None:
+    sentence = r"^sensors\.battery: expected the effect battery, got none$"
+    with pytest.raises(InputError, match=sentence):
+        EnvConfig.from_keywords(HOVER, sensors={"battery": True})
+
+
 # --- rate, delay and dropout ----------------------------------------------------------------------
 
 
