@@ -33,9 +33,9 @@ APART = 10
 MOST_MOTORS = 8
 AT_ONCE = 8
 """Commands that its CLI is given together: they and the answers fit into its buffers."""
-STARTS = 5
-"""Of a program until its CLI answers."""
-CLI_ANSWER = 1.5
+MORE_STARTS = 4
+"""Most starts of a program after the first one, until its CLI answers."""
+CLI_ANSWER = 2.0
 """Longest time for an answer of its CLI, s."""
 FOREVER = 10**6
 """Longer than a program is configured, s of its clock."""
@@ -151,10 +151,11 @@ def _told(link: socket.socket, *commands: str, end: str = _PROMPT) -> str:
 
 @cache
 def configured(
-    path: Path | None, commands: tuple[str, ...], lockstep: bool, starts: int = STARTS
+    path: Path | None, commands: tuple[str, ...], lockstep: bool, more: int = MORE_STARTS
 ) -> tuple[tuple[int, int], bytes]:
     """A program's release, year and month, and its memory after commands of its CLI. It runs once
-    for this, or anew: where its start is slow, a thread of it may drop the CLI's port.
+    for this. It is started anew, at most `more` times, where its CLI does not answer: if it starts
+    slowly, one of its threads may close the CLI's port.
 
     Raises `InputError`, or `PeerSilent`.
     """
@@ -172,9 +173,9 @@ def configured(
                 _told(link, "save", end="Rebooting")
             return version, (program.folder / _MEMORY).read_bytes()
         except OSError as error:
-            if path is None or starts == 1 or not isinstance(error, TimeoutError):
+            if not (path and more and isinstance(error, TimeoutError)):
                 raise program.silent(f"its CLI, got none: {error}") from None
-    return configured(path, commands, lockstep, starts - 1)
+    return configured(path, commands, lockstep, more - 1)
 
 
 class Betaflight(Stack):

@@ -186,7 +186,7 @@ int select(int count, fd_set *reads, fd_set *writes, fd_set *errors, struct time
     if (stamp >= 0.0) { /* it has taken over the last state */
         go_on_to(stamp);
         stamp = -1.0;
-        watch(count - 1);
+        watch(count - 1); /* its one socket */
     }
     return (int)syscall(SYS_select, count, reads, writes, errors, timeout);
 }

@@ -2,7 +2,6 @@
 
 import math
 import os
-import select
 import shlex
 import shutil
 import socket
@@ -12,6 +11,7 @@ import weakref
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, suppress
 from functools import cache
+from itertools import count
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TypeVar
@@ -27,9 +27,10 @@ _MOST = 16
 WATCH = 0.001
 """Time for which this thread watches for an answer, s, before it sleeps until one comes."""
 REST = 0.1
-"""Time without watching after that, s: others may want the core."""
+"""After a watch without an answer, time until it watches again, s: others may want the core."""
 _BEHIND = 0.005  # s: a longer delay of real time is not made up for
 _LOG = "output.txt"
+_STARTED = count()
 
 Answer = TypeVar("Answer")
 
@@ -58,7 +59,7 @@ class Program:
         self.folder = Path(self._closing.enter_context(TemporaryDirectory(prefix="rotorgram-")))
         self._process: subprocess.Popen[bytes] | None = None
         self._there: tuple[str, int] | None = None  # from where it sends
-        self.sent_at = self._watch_from = math.inf
+        self.sent_at = self._watch_from = math.inf  # when it watches again: never on one core
         self._period: float | None = None
         self._due = self._heard = 0.0
         last = (_MOST - 1) * apart
@@ -83,8 +84,8 @@ class Program:
         """Run it in the folder, its output in a file there. Without a program, say how the user
         starts it, and wait for it.
 
-        With a period of its steps, s, it keeps its own clock. Without one it gets a core of its
-        own, and this thread watches for its answers: who sleeps wakes late for each turn.
+        With a period of its steps, s, it keeps its own clock. Without one it is kept on one of
+        several cores, and this thread watches for its answers: a thread that sleeps wakes late.
         """
         self._period = period
         if program is None:
@@ -108,14 +109,14 @@ class Program:
             stderr=subprocess.STDOUT,
             process_group=0,
         )
+        self._closing.enter_context(self._process)  # waits for its end
+        self._closing.callback(self._process.kill)  # while it waits it takes no other signal
         if period is None:
             with suppress(OSError, AttributeError):  # a system where cores cannot be chosen
                 if others := sorted(os.sched_getaffinity(0))[1:]:
-                    core = others[(os.getpid() + self.moved) % len(others)]
+                    core = others[(os.getpid() + next(_STARTED)) % len(others)]
                     os.sched_setaffinity(self._process.pid, {core})
                     self._watch_from = 0.0
-        self._closing.enter_context(self._process)  # waits for its end
-        self._closing.callback(self._process.kill)  # while it waits it takes no other signal
 
     def listen(self, port: int) -> socket.socket:
         """A socket that gets what the program sends there. It does not wait."""
@@ -134,19 +135,18 @@ class Program:
         answer for too long, `PeerClosed` if it has ended.
         """
         where = where or self.link
-        with suppress(ConnectionRefusedError):
+        with suppress(TimeoutError, ConnectionRefusedError):
             while (now := time.monotonic()) < self.sent_at + ANSWER:
+                watches = max(self._watch_from, self.sent_at) <= now < self.sent_at + WATCH
+                if self._watch_from <= now and not watches:
+                    self._watch_from = now + REST
+                where.settimeout(0.0 if watches else wait)
                 try:
-                    datagram, sender = where.recvfrom(2048, socket.MSG_DONTWAIT)
-                    if where is not self.link or sender == self._there:
-                        return datagram
+                    datagram, sender = where.recvfrom(2048)
                 except BlockingIOError:
-                    if self._watch_from <= now:
-                        if self.sent_at <= now < self.sent_at + WATCH:
-                            continue
-                        self._watch_from = now + REST
-                    if not select.select([where], [], [], wait)[0]:
-                        break
+                    continue
+                if where is not self.link or sender == self._there:
+                    return datagram
         raise self.silent(f"an answer within {wait:g} s, got none")
 
     def meet(self, read: Callable[[bytes], object]) -> bytes:

@@ -9,7 +9,7 @@
 enum { TURNS = 4000, LEFT = 500 };
 static const int64_t SHARED = 1000000; /* ns */
 
-/* Of the machine, ns, whatever clock the program has. */
+/* Time of the machine, ns: not that of the clock which the program sees. */
 static int64_t time_now(void)
 {
     struct timespec time;

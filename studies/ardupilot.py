@@ -2,19 +2,17 @@
 
 `python studies/ardupilot.py --program PATH` writes `docs/results/ardupilot.json`, which
 `docs/autopilots.md` shows. The program is its SITL. Each waypoint counts as reached within the
-radius that stands with it. The times real time are those of the flight alone, those of the clock
-from the program's start on, and those per second of processor time of both processes, which other
-work on the machine does not change much. It takes four minutes on two cores.
+radius that stands with it. `times real time` counts the flight alone, and all of the program's
+clock from its start on. It takes four minutes on two idle cores.
 """
 
-import resource
 import subprocess
 import sys
 import time
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 from measuring import RESULTS, options, write
@@ -50,8 +48,6 @@ class Clock:
     first: float = 0.0
     """Wall time of the first step of the flight, s."""
     last: float = 0.0
-    used: float = 0.0
-    """Processor time of both processes, s."""
     steps: int = 0
     flown: int = 0
 
@@ -60,7 +56,6 @@ class Clock:
         return {
             "flight": round(self.flown / rate / (self.last - self.first), 1),
             "with the start": round(self.steps / rate / (self.last - self.made), 1),
-            "of processor time": round(self.steps / rate / self.used, 1),
         }
 
 
@@ -70,29 +65,19 @@ class Timed:
     def __init__(self, stack: Stack, clock: Clock) -> None:
         self._stack = stack
         self._clock = clock
-        self.close = stack.close
 
-    order_every = property(lambda self: self._stack.order_every)
-    ready = property(lambda self: self._stack.ready)
-    why = property(lambda self: self._stack.why)
-    late = property(lambda self: self._stack.late)
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._stack, name)
 
     def step(self, reading: Reading, order: Order | None, observation: Observation) -> Floats:
         clock = self._clock
-        flies = order is not None and not order.stands
-        if flies and not clock.flown:
+        if order is not None and not order.stands and not clock.first:
             clock.first = time.perf_counter()
         throttles = self._stack.step(reading, order, observation)
         clock.last = time.perf_counter()
         clock.steps += 1
-        clock.flown += flies
+        clock.flown += clock.first > 0.0
         return throttles
-
-
-def processor_time() -> float:
-    """Of this process and of those that it ended, s."""
-    ended = resource.getrusage(resource.RUSAGE_CHILDREN)
-    return time.process_time() + ended.ru_utime + ended.ru_stime
 
 
 def fly(program: Path, env: str, vehicle: str, **keywords: object) -> tuple[Trajectory, Clock]:
@@ -103,10 +88,8 @@ def fly(program: Path, env: str, vehicle: str, **keywords: object) -> tuple[Traj
     make: MakeStack = lambda start: Timed(ArduPilot(start), clock)  # noqa: E731
     with closing(LocalVectorEnv(config, 1, autoreset_mode="Disabled")) as opened:
         seat = Seat(opened.env_spec, start, make)
-        before = processor_time()
         (flight,) = fly_episodes(opened, seat, 1, "final")
         seat.close()
-        clock.used = processor_time() - before
     if seat.tally.late or seat.tally.faults:
         raise SystemExit(f"{vehicle}: expected a flight in lock-step, got {seat.tally}")
     return flight, clock

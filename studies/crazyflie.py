@@ -6,16 +6,14 @@ The program is the firmware's SITL. Each controller flies `rotorgram/Hover-v0` w
 in lock-step, from tilted starts of the final set, up to 0.5 m from the goal along each axis. The
 error is the mean distance in the last quarter of a flight: until then the firmware's integrals
 settle. `settling` is the time after which it stays within 10 cm. `repeated` are the hashes of one
-flight, of a process each. `times_real_time` counts the time on the stand too. On a busy machine
-look at `processor_seconds`, of this process and the program together, for a second of the program's
-clock. `mutated` counts what became of damaged datagrams of motors.
+flight, of a process each. `times_real_time` counts the time on the stand too. `mutated` counts what
+became of damaged datagrams of motors.
 
 It takes ten minutes on two cores.
 """
 
 import os
 import re
-import resource
 import statistics
 import subprocess
 import sys
@@ -40,11 +38,6 @@ MODES = ("pid", "mellinger", "indi", "brescianini")
 BOOT = 4.0  # s: about what it stands
 
 
-def processor_seconds() -> float:
-    used = resource.getrusage(resource.RUSAGE_CHILDREN)
-    return time.process_time() + used.ru_utime + used.ru_stime
-
-
 def fly(program: Path, mode: str, seconds: float, episodes: int) -> Mapping[str, object]:
     """Figures of a controller's flights."""
     steps = round(50 * seconds)
@@ -52,13 +45,11 @@ def fly(program: Path, mode: str, seconds: float, episodes: int) -> Mapping[str,
                 "episode_length": steps}  # fmt: skip
     config = seated(EnvConfig.from_keywords(ENV, **settings), STACK.rate)
     start = Start(config, config.load_vehicle(), mode, program)
-    used = processor_seconds()
     began = time.perf_counter()
     with closing(LocalVectorEnv(config, autoreset_mode="Disabled")) as env:
         seat = Seat(env.env_spec, start, STACK.make)
         flown = fly_episodes(env, seat, episodes, "final")
     wall = time.perf_counter() - began
-    used = processor_seconds() - used
     clock = sum(one.seconds for one in flown) + BOOT * episodes
     errors = [np.linalg.norm(one.pose[1:, :3] - one.telemetry["goal"][1:, :3], axis=1)
               for one in flown]  # fmt: skip
@@ -73,7 +64,6 @@ def fly(program: Path, mode: str, seconds: float, episodes: int) -> Mapping[str,
         "steps": sum(map(len, flown)),
         "faults": seat.tally.faults,
         "times_real_time": round(clock / wall, 2),
-        "processor_seconds": round(used / clock, 3),
         "load_average": round(os.getloadavg()[0], 1),
     }
 

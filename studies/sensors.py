@@ -61,9 +61,9 @@ def gyroscope() -> np.ndarray:
     world.reset(every, InitialState(position=np.tile((0.0, 0.0, 5.0), (_WORLDS, 1, 1))))
     sensors.begin(every)
     readings = np.empty((_SAMPLES, _WORLDS * 3))
-    for row in readings:
+    for step, row in enumerate(readings, 1):
         row[:] = sensors.readings["imu"][..., :3].ravel()
-        sensors.sample(every)
+        sensors.sample(every, step)
     return readings
 
 

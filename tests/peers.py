@@ -11,6 +11,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+from rotorgram.envs.loop import Loop
 from rotorgram.udp import LinkConfig, Simulator
 
 ANY = ("127.0.0.1", 0)
@@ -50,7 +51,10 @@ class Running:
 def simulate(agent: Any, config: LinkConfig = QUICK, **arguments: Any) -> Running:
     """A simulator for an agent, given itself or by its address."""
     server = getattr(agent, "address", agent)
-    return Running(Simulator(server=server, config=config, **{"bind": ANY, **arguments}))
+    simulator = Simulator(server=server, config=config, **{"bind": ANY, **arguments})
+    if isinstance(simulator.stepped, Loop):
+        simulator.stepped.prepare()  # tests wait for less than that may take
+    return Running(simulator)
 
 
 def launch(code: str, *arguments: object, stdin: int | None = None) -> subprocess.Popen[str]:

@@ -106,8 +106,8 @@ class RemoteEnv(_Remote, gym.Env[Observation, ArrayLike]):
         options: A simulator of other options is refused; None takes any. Those that are not given
             have their defaults if the env is registered here, and any value otherwise.
         vehicle_hash: A simulator of another vehicle is refused; None takes any.
-        connect_timeout: Longest wait for a simulator, s, the first or one that replaces another;
-            60.
+        connect_timeout: Longest wait for a simulator, s, the first or one that replaces another,
+            its compilation included; 60.
         timeout: Longest wait for an answer from it, s, before another may take its slot; 30. While
             it computes, it says so.
         key_file: File with the key that the simulators have too (`rotorgram key`). With it any

@@ -154,7 +154,7 @@ class Sensor(Source):
         self._readings = chosen(mask, readings, self._readings)
 
     def sample(self, mask: Array, steps: Array) -> None:
-        """As of `Sensors`."""
+        """As `Sensors.sample`."""
         due = mask & (steps % self.values["every"] == 0)
         fresh = due
         parameters = self.world.parameters

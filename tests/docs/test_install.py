@@ -143,7 +143,7 @@ def test_flags_are_checked_before_anything_heavy_is_imported(command: str) -> No
     ],
 )
 def test_a_command_starts_in_time(words: str) -> None:
-    compiled_once = {**os.environ, "PYTHONDONTWRITEBYTECODE": ""}  # as what pip installs
+    compiled_once = {**os.environ, "PYTHONDONTWRITEBYTECODE": ""}  # with bytecode, which pip writes
 
     def seconds(*command: str) -> float:
         begin = time.perf_counter()
