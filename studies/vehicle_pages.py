@@ -140,7 +140,7 @@ def sensors(vehicle: Vehicle) -> list[str]:
     for name, kind in SENSOR_TYPES.items():
         settings = [one for one in kind.about.settings.values() if one.default is None]
         needs = [vehicle.coefficients[one.coefficient] for one in settings if one.coefficient]
-        if None not in needs:
+        if needs and None not in needs:
             able.append(name)
     return able
 
