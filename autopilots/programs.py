@@ -59,7 +59,8 @@ class Program:
         self.folder = Path(self._closing.enter_context(TemporaryDirectory(prefix="rotorgram-")))
         self._process: subprocess.Popen[bytes] | None = None
         self._there: tuple[str, int] | None = None  # from where it sends
-        self.sent_at = self._watch_from = math.inf  # when it watches again: never on one core
+        # `_watch_from`: when answers are watched for again; never before it has a core of its own.
+        self.sent_at = self._watch_from = math.inf
         self._period: float | None = None
         self._due = self._heard = 0.0
         last = (_MOST - 1) * apart

@@ -93,7 +93,7 @@ class Loop:
         self.quantities = quantities_of(task)
         self._throws = [event["kind"] == BALL for event in flown.events]
         self._closed = False
-        self._told: Told | None = None  # None: what record, world and task say when asked
+        self._told: Told | None = None  # None: record, world and task are asked instead
         self.observations: ByName
         self._take()
 

@@ -9,6 +9,7 @@ import subprocess
 import sys
 import textwrap
 import time
+from ast import literal_eval
 from collections import deque
 from itertools import islice
 from pathlib import Path
@@ -82,7 +83,7 @@ def test_in_lock_step_programs_have_cores_and_leave_one():
     before = os.sched_getaffinity(0)
     others = len(before) - 1
     running = [started(CORES) for _ in range(others)]
-    taken = [eval(program.meet(any_of).decode()) for program in running]
+    taken = [literal_eval(program.meet(any_of).decode()) for program in running]
     assert all(len(cores) == 1 and cores < before for cores in taken)
     assert len(set().union(*taken)) == others
     assert os.sched_getaffinity(0) == before
