@@ -1,7 +1,7 @@
 """The controllers of the level `position`, flown to the goal of any task that tells where it is."""
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from typing import ClassVar
 
 import numpy as np
@@ -9,7 +9,7 @@ import numpy as np
 from ..envs.spec import EnvSpec, component_names
 from ..models.errors import InputError
 from .layers import ByName, Floats
-from .policies import Array, Observation, flat
+from .policies import Array, Observation, flat, lead_of
 
 DAMPING = 0.5  # Damping ratio of a payload's swing
 FILTER = 20.0  # Rate of the filters over that of the position loop
@@ -37,6 +37,7 @@ class Geometric:
 
     options: ClassVar[Mapping[str, object]] = {"action": "position"}
     """Options of the env that it flies."""
+    many = True
 
     def __init__(self, spec: EnvSpec) -> None:
         names = spec.action.components
@@ -82,10 +83,11 @@ class Geometric:
 
     def act(self, observation: Observation) -> Floats:
         """Offset and heading as the env's action, float32, shape (4,)."""
-        numbers = flat(observation, self._spec).astype(np.float64)
-        now = {name: numbers[at] for name, at in self._at.items()}
-        over_hover = numbers[self._rotors].mean() if self._rotors else 0.0
-        lift = self._gravity * (1.0 + over_hover)
+        lead = lead_of(observation, self._spec)
+        numbers = flat(observation, self._spec, *lead).astype(np.float64)
+        now = {name: numbers[..., at] for name, at in self._at.items()}
+        over_hover = numbers[..., self._rotors].mean(axis=-1) if self._rotors else 0.0
+        lift = np.asarray(self._gravity * (1.0 + over_hover))[..., None]
         now["force"] = lift * now["thrust axis"] - (0.0, 0.0, self._gravity)
         before = self._before or now
         goes = self._follow(now)
@@ -97,13 +99,15 @@ class Geometric:
             faster = (now["force"] - before["force"]) / self._period
             from_goal = -now["goal - position"]
             moves = now["velocity"] - self._moving
-            seen = (from_goal, moves, *(now[name] for name in _PAYLOAD), now["force"], faster)
-            wanted = goes - self._pushed - self._swing @ np.array(seen)
+            payload = (now[name] for name in _PAYLOAD)
+            seen = np.stack((from_goal, moves, *payload, now["force"], faster), axis=-2)
+            wanted = goes - self._pushed - self._swing @ seen
             steadied = wanted / (OVER * k * k) + now["velocity"] / k
-            offset[:2] = steadied[:2]
-        nose = now["nose"][:2]
-        c, s = nose / max(math.hypot(*nose), 1e-6)
-        return level_action(offset, c, s, -math.atan2(s, c), self._scale)
+            offset[..., :2] = steadied[..., :2]
+        x, y, _ = np.moveaxis(now["nose"], -1, 0)
+        size = np.maximum(np.hypot(x, y), 1e-6)
+        c, s = x / size, y / size
+        return level_action(offset, c, s, -np.arctan2(s, c), self._scale)
 
     def _follow(self, now: ByName) -> Array:
         """Filter the goal's velocity and what pushes; return the goal's acceleration, m/s²."""
@@ -116,25 +120,26 @@ class Geometric:
         moving = moved / period + (now["velocity"] + before["velocity"]) / 2
         pushed = faster / period - (now["force"] + before["force"]) / 2
         if self._swing is not None:
-            pushed[:2] -= self._pull * now[_PAYLOAD[0]][:2]
+            pushed[..., :2] -= self._pull * now[_PAYLOAD[0]][..., :2]
         self._pushed = self._pushed + self._share * (pushed - self._pushed)
-        if np.abs(moving).max() > JUMP * self._scale[0] * self._gain:
-            self._moving = np.zeros(3)
-            return np.zeros(3)
-        change: Array = self._share * (moving - self._moving)
-        self._moving = self._moving + change
+        fastest = np.abs(moving).max(axis=-1, keepdims=True)
+        jumped = fastest > JUMP * self._scale[0] * self._gain
+        change: Array = np.where(jumped, 0.0, self._share * (moving - self._moving))
+        self._moving = np.where(jumped, 0.0, self._moving + change)
         return change / period
 
 
-def level_action(vector: Iterable[float], c: float, s: float, turn: float, scale: Array) -> Floats:
-    """The action of a level that takes a vector and a number, float32, shape (4,).
+def level_action(vector: Array, c: Array, s: Array, turn: Array, scale: Array) -> Floats:
+    """The action of a level that takes a vector and a number, float32, shape (..., 4).
 
-    The vector is of the world frame; the action has it forward, to the left and up, by the cosine
-    and the sine of the heading.
+    The vector, (..., 3), is of the world frame; the action has it forward, to the left and up, by
+    the cosine and the sine of the heading, (...).
     """
-    x, y, z = vector
-    action = np.array((c * x + s * y, c * y - s * x, z, turn)) / scale
-    action[:2] /= max(1.0, math.hypot(*action[:2]))
+    x, y, z = np.moveaxis(vector, -1, 0)
+    parts = (c * x + s * y, c * y - s * x, z, turn + 0.0 * z)
+    action = np.stack(parts, axis=-1) / scale
+    level = np.hypot(action[..., :1], action[..., 1:2])
+    action[..., :2] /= np.maximum(level, 1.0)
     clipped: Floats = np.clip(action, -1.0, 1.0).astype(np.float32)
     return clipped
 

@@ -232,15 +232,24 @@ class Chain(Layer):
 
 
 class Scaling(Layer):
-    """Distances as nearness and bytes of pictures as 0 to 1, in their place; the others stay.
+    """Distances as nearness, bytes of pictures as 0 to 1, and lengths d as d / (1 + |d| / reach),
+    in their place; the others stay.
 
-    A distance d >= 0 m is 2 / (1 + d / 2 m) - 1 / 2: what is near differs most. `distances` and
-    `pictures` are slices of the inputs.
+    A distance d >= 0 m is 2 / (1 + d / 2 m) - 1 / 2: what is near differs most. `distances`,
+    `pictures` and `lengths` are slices of the inputs.
     """
 
-    def __init__(self, distances: Sequence[slice], pictures: Sequence[slice]) -> None:
+    def __init__(
+        self,
+        distances: Sequence[slice],
+        pictures: Sequence[slice],
+        lengths: Sequence[slice],
+        reach: float | None,
+    ) -> None:
         self.distances = distances
         self.pictures = pictures
+        self.lengths = lengths if reach else ()
+        self.reach = np.float32(reach or 1.0)
 
     def forward(self, inputs: Floats) -> Floats:
         self._seen = seen = inputs[..., 1:, :]
@@ -253,6 +262,12 @@ class Scaling(Layer):
             values -= 0.5
         for place in self.pictures:
             seen[..., place, :] /= BRIGHTEST
+        self._factors = []
+        for place in self.lengths:
+            values = seen[..., place, :]
+            factors = 1.0 / (1.0 + np.abs(values) / self.reach)
+            values *= factors
+            self._factors.append(factors)
         return inputs
 
     def back(self, slope: Floats) -> Floats:
@@ -261,6 +276,8 @@ class Scaling(Layer):
             slope[..., place, :] *= -0.25 * values * values
         for place in self.pictures:
             slope[..., place, :] /= BRIGHTEST
+        for place, factors in zip(self.lengths, self._factors, strict=True):
+            slope[..., place, :] *= factors * factors
         return slope
 
 

@@ -8,7 +8,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from ..envs.spec import ArraySpec
+from ..envs.spec import ArraySpec, component_units
 from ..models.errors import InputError
 from .config import Config
 from .convolutions import Encoder, is_grid, slices
@@ -38,8 +38,9 @@ class Network(Chain):
         self.inputs = inputs = sum(array.size for array in arrays)
         layers: list[Layer] = []
         scaled = scaled_in(arrays)
-        if any(scaled):
-            layers.append(Scaling(*scaled))
+        lengths = lengths_in(arrays) if config.reach else []
+        if any(scaled) or lengths:
+            layers.append(Scaling(*scaled, lengths, config.reach))
         if self.convolves:
             if not any(map(is_grid, arrays)):
                 names = ", ".join(array.name for array in arrays)
@@ -113,3 +114,14 @@ def scaled_in(arrays: Sequence[ArraySpec]) -> tuple[list[slice], list[slice]]:
         elif array.dtype == "uint8" and array.high == BRIGHTEST:
             pictures.append(place)
     return distances, pictures
+
+
+def lengths_in(arrays: Sequence[ArraySpec]) -> list[slice]:
+    """Where arrays, one after the other, have numbers in m that may be below 0."""
+    units: list[bool] = []
+    for array in arrays:
+        low = np.broadcast_to(array.bounds()[0], array.shape).ravel()
+        own = zip(component_units(array), low, strict=True)
+        units += [unit == "m" and least < 0 for unit, least in own]
+    ends = np.flatnonzero(np.diff([False, *units, False])).tolist()
+    return [slice(*pair) for pair in zip(ends[::2], ends[1::2], strict=True)]

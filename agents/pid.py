@@ -8,7 +8,7 @@ import numpy as np
 from ..envs.spec import EnvSpec
 from ..models.errors import InputError
 from .layers import Floats
-from .policies import Observation
+from .policies import Array, Observation
 
 ENV_ID = "rotorgram/Elevation-v0"
 GRAVITY = 9.8  # m/s²: the paper's
@@ -31,6 +31,7 @@ class PID:
 
     options: ClassVar[Mapping[str, object]] = {}
     """Options of the env that it needs."""
+    many = True
 
     def __init__(self, spec: EnvSpec) -> None:
         options = spec.options
@@ -55,21 +56,22 @@ class PID:
         self._scale = options["thrust_scale"] or share * float(highest.max())
         self._period = spec.control_period
         self._name = spec.observation[0].name
-        self._integral = 0.0
+        self.reset()
 
     def reset(self) -> None:
         """Forget the integral."""
-        self._integral = 0.0
+        self._integral: Array = np.zeros(())
 
     def act(self, observation: Observation) -> Floats:
         """Change of thrust, or thrust over hover, as the env's action, float32, shape (1,)."""
         own = observation[self._name] if isinstance(observation, Mapping) else observation
-        error, rate, thrust = own.tolist()[-3:]  # the newest of a history
-        if abs(error) < INTEGRAL_BAND:
-            self._integral += error * self._period
+        # The newest of a history.
+        error, rate, thrust = np.moveaxis(own[..., -3:].astype(np.float64), -1, 0)
+        near = np.abs(error) < INTEGRAL_BAND
+        self._integral = self._integral + np.where(near, error, 0.0) * self._period
         acceleration = PROPORTIONAL * error + DERIVATIVE * rate + INTEGRAL * self._integral
         wanted = acceleration * self._hover / GRAVITY
         if self._increment:
-            wanted -= thrust * self._hover
-        action = wanted / self._scale
-        return np.array((min(max(action, -1.0), 1.0),), np.float32)
+            wanted = wanted - thrust * self._hover
+        action: Floats = np.clip(wanted / self._scale, -1.0, 1.0)[..., None].astype(np.float32)
+        return action

@@ -20,7 +20,11 @@ Action = Array | int
 
 
 class Policy(Protocol):
-    """Chooses actions: called once for each control step."""
+    """Chooses actions: called once for each control step.
+
+    With an attribute `many` that is true, an object may also fly N drones, whose episodes all begin
+    with `reset`: observations then have a first axis of N, and so has what `act` returns.
+    """
 
     def reset(self) -> None:
         """Forget the last episode."""
@@ -38,6 +42,13 @@ def flat(observations: Observation, spec: EnvSpec, *lead: int) -> Array:
         return np.asarray(observations, np.float32).reshape(*lead, -1)
     arrays = [np.asarray(observations[array.name], np.float32) for array in spec.observation]
     return np.concatenate([array.reshape(*lead, -1) for array in arrays], axis=-1)
+
+
+def lead_of(observation: Observation, spec: EnvSpec) -> tuple[int, ...]:
+    """Axes of an observation before those of the spec: none of one drone, (N,) of many."""
+    array = spec.observation[0]
+    first = observation[array.name] if isinstance(observation, Mapping) else observation
+    return np.shape(first)[: np.ndim(first) - len(array.shape)]
 
 
 def flat_size(spec: EnvSpec) -> int:
@@ -107,6 +118,8 @@ class NetworkPolicy(Module):
         shapes: Of its weights: those of the network and of the head.
     """
 
+    many = True
+
     def __init__(self, spec: EnvSpec, config: Config) -> None:
         self.spec = spec = spec.for_actor()
         self.actions = ActionMap(spec.action)
@@ -151,10 +164,11 @@ class NetworkPolicy(Module):
 
     def act(self, observation: Observation) -> Action:
         """The most likely action, inside the bounds of the env."""
-        output = self.outputs(flat(observation, self.spec, 1))
+        lead = lead_of(observation, self.spec)
+        output = self.outputs(flat(observation, self.spec, *(lead or (1,))))
         if isinstance(self.spec.action, Discrete):
-            return int(output.argmax())
-        return self.actions.to_envs(output).reshape(self.spec.action.shape)
+            return output.argmax(axis=1) if lead else int(output.argmax())
+        return self.actions.to_envs(output).reshape(*lead, *self.spec.action.shape)
 
     def outputs(self, observations: Floats) -> Floats:
         """Outputs of the network, shape (B, k), for flat observations, shape (B, n).

@@ -1,7 +1,7 @@
 """Presets: hyperparameters of an algorithm for a task, from `presets.toml`."""
 
-from collections.abc import Iterator
-from dataclasses import replace
+from collections.abc import Iterator, Mapping
+from dataclasses import field, replace
 from functools import cache
 from typing import Any, Literal
 
@@ -13,11 +13,11 @@ from ..models.files import read_own_toml
 from .config import Config
 from .registry import find_algorithm
 
-PresetName = Literal["paper", "tuned"]
+PresetName = Literal["paper", "tuned", "robust"]
 DEFAULT_TASK = "rotorgram/Elevation-v0"
 """Its presets serve tasks for which there is no other."""
 
-_FLIGHT = ("num_envs", "env_steps", "backend")
+_FLIGHT = ("num_envs", "env_steps", "backend", "perturbations")
 
 Tables = dict[str, dict[str, dict[str, Any]]]
 
@@ -37,6 +37,8 @@ class Preset:
     """Of all drones together."""
     backend: Backend | None = None
     """Of the training; None: the task's."""
+    perturbations: Mapping[str, float] = field(default_factory=dict, hash=False)
+    """What each episode draws: names of `envs.perturbations` and sizes."""
 
     def whole_worlds(self, drones: int) -> int:
         """`num_envs` in whole worlds of so many drones, one at least."""
@@ -66,6 +68,11 @@ def _lineage(env_id: str, tasks: list[str]) -> Iterator[str]:
         bases = task_type(env_id).__mro__[1:]
         by_class = {task_type(task): task for task in tasks if is_known(task)}
         yield from (by_class[base] for base in bases if base in by_class)
+
+
+def usual_preset(algorithm: str, env_id: str) -> PresetName:
+    """The preset of a training that names none: `robust` where the task has one."""
+    return "robust" if env_id in presets_of(algorithm).get("robust", ()) else "tuned"
 
 
 def find_preset(algorithm: str, name: str, env_id: str = DEFAULT_TASK) -> Preset:

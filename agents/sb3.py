@@ -153,9 +153,9 @@ class SB3Agent:
     """
 
     def __init__(self, log: EpisodeRecorder, config: A2CConfig | SACConfig, seed: int) -> None:
-        if config.network != "mlp" or config.memory:
-            got = f"{config.network!r} with a memory of {config.memory}"
-            raise InputError(f"network: expected mlp without memory with SB3, got {got}")
+        if config.network != "mlp" or config.memory or config.reach:
+            got = f"{config.network!r} with a memory of {config.memory} and reach {config.reach}"
+            raise InputError(f"network: expected mlp without memory and reach with SB3, got {got}")
         if log.spec != log.spec.for_actor():
             raise InputError("sb3: expected no privileged arrays, which SB3's actor would see too")
         if any(scaled_in(log.spec.observation)):

@@ -46,12 +46,17 @@ def trained(name: str, *others: str) -> Checkpoint:
 
     Raises `InputError`; the message also lists `others`.
     """
-    path = Path(name)
-    file = path / CHECKPOINT if path.is_dir() else path
+    file = checkpoint_file(name)
     if not file.is_file():
         expected = ", ".join([*others, "a checkpoint or the folder of a training"])
         raise InputError(f"policy: expected {expected}, got {name}, where there is no file {file}")
     return load(file)
+
+
+def checkpoint_file(name: str) -> Path:
+    """The file of a checkpoint, or of a training's folder."""
+    path = Path(name)
+    return path / CHECKPOINT if path.is_dir() else path
 
 
 def fitted(command: F, checkpoint: Pilot) -> F:

@@ -123,6 +123,8 @@ class EnvFlags(Command):
     those of a checkpoint. docs/effects.md lists them."""
     randomize: Words = ()
     """Parameters that are drawn for each episode, each NAME=DISTRIBUTION: mass=uniform(0.8,1.2)."""
+    observe_drawn: bool = False
+    """Observe what is drawn too, in an array for the critic of a training alone."""
     sensors: Words = ()
     """Sensors whose readings are observed, each NAME or NAME=SETTINGS: imu gps={"rate":10}, and
     observe=estimate. docs/sensors.md lists them."""

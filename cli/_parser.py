@@ -29,6 +29,7 @@ _PLAIN_FLAGS = (
     "control_period",
     "episode_length",
     "history",
+    "observe_drawn",
     "scene",
     "cameras",
     "events",

@@ -14,8 +14,10 @@ from threading import Timer
 from typing import TYPE_CHECKING
 
 from ..agents import Checkpoint, Episode, find_algorithm, find_preset, load, preset, store
+from ..agents.presets import usual_preset
 from ..envs.autoreset import AdvancingVectorEnv
 from ..envs.config import BackendConfig, EnvConfig
+from ..envs.perturbations import for_training
 from ..flights.folders import locked
 from ..models import Backend, InputError
 from ..models.errors import require
@@ -48,7 +50,12 @@ def begin(command: "Train") -> int:
     require("safetensors", "train", "writing checkpoints")
     _ = find_algorithm(command.algorithm).agent
     task = command.preset_of or command.env_id
-    base = find_preset(command.algorithm, command.preset, task)
+    name = command.preset or usual_preset(command.algorithm, task)
+    if command.listen is not None and name == "robust":
+        if command.preset:
+            raise InputError("preset: expected tuned with --listen: the simulator has the env")
+        name = "tuned"
+    base = find_preset(command.algorithm, name, task)
     if not base.fits:
         if command.preset_of:
             raise InputError(
@@ -60,10 +67,16 @@ def begin(command: "Train") -> int:
             f"note: there is no preset of {command.algorithm} for {task}, nor for a task that it "
             f"derives from: it gets {got}; --preset-of ID names another"
         )
-    config = preset(command.algorithm, command.preset, task, **command.changes())
+    config = preset(command.algorithm, name, task, **command.changes())
     backend = command.backend or base.backend
+    flown = command.env_config(backend=backend)  # it refuses wrong drones
+    if base.perturbations:
+        flown, refused = for_training(flown, base.perturbations)
+        for perturbation, sentence in refused.items():
+            print(f"note: preset robust: not drawn: {perturbation}: {sentence}")
+        command = replace(command, options=flown.flat_options())
     run = Run(
-        env=command.env_config(backend=backend),  # it refuses wrong drones
+        env=flown,
         algorithm=command.algorithm,
         config=config,
         seed=command.seed,
@@ -72,8 +85,8 @@ def begin(command: "Train") -> int:
     )
     required = bool(command.options) or "env" in command.given
     opened = _opened(command, run.num_envs, backend, required=required)
-    name = f"{run.algorithm}-seed{run.seed}"
-    with folder_to_write(command.out, name) as folder, opened as env, locked(folder):
+    folder_name = f"{run.algorithm}-seed{run.seed}"
+    with folder_to_write(command.out, folder_name) as folder, opened as env, locked(folder):
         spec = env.env_spec  # of the simulator that came
         if command.listen is not None:
             run = replace(run, env=config_of(spec, backend, command.vehicle))

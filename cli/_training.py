@@ -17,8 +17,10 @@ class TrainingFlags(EnvFlags):
 
     set: NamedValues = ()
     """Changes to the preset of every agent: gamma=0.99 hidden=[64,64]."""
-    preset: PresetName = "tuned"
-    """Hyperparameters: the paper's (of vpg and a2c), or ours, which may depend on the task."""
+    preset: PresetName | None = None
+    """Hyperparameters: the paper's (of vpg and a2c), tuned ones, which may depend on the task, or
+    robust ones, which draw starts, craft and air anew in each episode. Default: robust of train
+    where the task has it, tuned elsewhere."""
     env_steps: Count | None = None
     """Env steps of each training, of all its drones together. Default of train: the preset's."""
     num_envs: Count | None = None

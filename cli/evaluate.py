@@ -1,9 +1,11 @@
 """`rotorgram evaluate`: fly episodes without exploration, print the means."""
 
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import Positional, arg
 
+from ..models.errors import InputError
 from ._flags import AgentFlags, Count, MavlinkFlags
 
 if TYPE_CHECKING:
@@ -15,8 +17,16 @@ class Evaluate(AgentFlags, MavlinkFlags):
 
     policy: Positional[Annotated[str, arg(metavar="POLICY")]]
     """Checkpoint, folder of a training, pid, geometric, or FILE.py:CLASS of a controller."""
-    episodes: Count = 20
-    """Episodes to fly, from seeds that no training uses."""
+    episodes: Count | None = None
+    """Episodes to fly, from seeds that no training uses. Default: 20; of each cell of the table of
+    --robustness 1,000."""
+    robustness: bool = False
+    """Fly under every perturbation that docs/robustness.md lists, beside the controllers that can:
+    a table, a figure and every flight."""
+    out: Path | None = None
+    """With --robustness: folder to write; it must not exist. Default: one in runs/."""
+    jobs: Count | None = None
+    """With --robustness: envs at a time. Default: one for each core."""
 
     def run(self) -> None:
         """Fly and print the means."""
@@ -27,11 +37,18 @@ class Evaluate(AgentFlags, MavlinkFlags):
 
         checkpoint = load_pilot(self.policy)
         command = in_unseen(fitted(self, checkpoint))
+        if self.robustness:
+            from ._robustness import measure_robustness
+
+            measure_robustness(command, self.episodes or 1000)
+            return
+        if self.out or self.jobs:
+            raise InputError("out, jobs: expected them with --robustness, got it off")
         with remote_env(command, num_envs=command.drones) as env:
             Headline.of(env.env_spec)  # an env without one is refused before it is flown
             policy = policy_for(command, checkpoint, env.env_spec)
             with mavlink_out(self, env.env_spec) as env.observer:
-                trajectories = fly_episodes(env, policy, self.episodes, "final")
+                trajectories = fly_episodes(env, policy, self.episodes or 20, "final")
         print_means(self.policy, trajectories)
 
 

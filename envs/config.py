@@ -116,6 +116,8 @@ class EnvConfig:
     effects: EffectOptions = NO_EFFECTS
     randomize: Options = field(default_factory=dict, hash=False)
     """Distributions of what is drawn for each episode: names of `sim.PARAMETERS` to texts."""
+    observe_drawn: bool = False
+    """Observe what is drawn too, in an array for the critic of a training alone."""
     sensors: Options = field(default=None, hash=False)  # type: ignore[arg-type]  # as the scene
     """Settings by sensor, or true; see `sim/sensors`. None given: the task's."""
     cameras: tuple[str, ...] = ()
@@ -221,7 +223,9 @@ class EnvConfig:
             scene = replace(scene, options={})
         values["scene"] = None if self.scene == usual.scene else str(scene)
         values["task"] = {name: value for name, value in self.task.items() if name in KEYWORDS}
-        values = {name: value for name, value in values.items() if value not in (None, (), {})}
+        values = {
+            name: value for name, value in values.items() if value not in (None, (), {}, False)
+        }
         if self.sensors != usual.sensors:
             values["sensors"] = self.sensors
         shown = {name: value for name, value in self.task.items() if name not in KEYWORDS}
@@ -258,8 +262,9 @@ class EnvConfig:
         """All fields as JSON values, with the version."""
         content = {"version": VERSION, **vars(self), "effects": self.effects.to_options()}
         content |= {"scene": asdict(self.scene), "backend": asdict(self.backend)}
-        if not self.events:
-            content.pop("events")
+        for name in ("events", "observe_drawn"):
+            if not content[name]:
+                content.pop(name)
         return json_values(content)
 
     @classmethod
@@ -411,8 +416,8 @@ class EnvConfig:
 _DEFAULTS = ("vehicle", "sensors", "backend")
 _FROM_TASK = ("action", "control_period", "episode_length")
 _OPTIONS = (
-    "episode_length", "action", "control_period", "history", "effects", "randomize", "sensors",
-    "cameras", "events",
+    "episode_length", "action", "control_period", "history", "effects", "randomize",
+    "observe_drawn", "sensors", "cameras", "events",
 )  # fmt: skip
 BACKEND_KEYWORDS = ("num_threads", "dtype", "compiled")
 """Keywords that are settings of the backend."""

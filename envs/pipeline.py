@@ -13,7 +13,7 @@ from .stages.events import Events
 from .stages.flight import Control, Flight, StandStill
 from .stages.history import History, ObservationDelay
 from .stages.judge import Judge, Remember, Starts
-from .stages.measure import Measure, Readings, Sensing
+from .stages.measure import Drawn, Measure, Readings, Sensing
 from .stages.radio import Radio
 from .stages.record import Stage
 from .tasks.task import Task
@@ -74,6 +74,8 @@ class Pipeline:
             observing.append(ObservationDelay(world, longest))
         if config.history > 1:
             observing.append(History(config.history))
+        if config.observe_drawn:
+            observing.append(Drawn(world))
         observing.append(Ends(config.env_id, task.episode_length))
 
         self.stages = [Starts(task, world), *flying, *events, *observing]

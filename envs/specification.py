@@ -13,6 +13,7 @@ from .events import asks_of
 from .pictures import Pictures, arrays_of, objects_of_all
 from .spec import ArraySpec, Discrete, EnvSpec
 from .stages.history import with_history
+from .stages.measure import drawn_array
 from .tasks.task import Task
 from .telemetry import quantities_of
 
@@ -50,6 +51,8 @@ def spec_of(config: EnvConfig, task: Task) -> EnvSpec:
     """The `EnvSpec` of a config's env, whose task is made."""
     observation = [with_history(array, config.history) for array in observed(task)]
     observation += _pictures(task)
+    if config.observe_drawn:
+        observation.append(drawn_array(task.config.drawn))
     for sensor in range_sensors_in(task):
         array = ArraySpec(
             name=sensor.name,

@@ -28,6 +28,8 @@ OnProgress = Callable[[str, int, int, str], None]
 """Called with a job's name, the amounts done and in total, and a status text."""
 Tell = Callable[[int, int, str], None]
 """The same for one job, without its name."""
+ALL_JOBS = "all runs"
+"""Name under which the progress of all jobs is reported."""
 _Job = TypeVar("_Job")
 _Value = TypeVar("_Value")
 
@@ -84,7 +86,7 @@ def run_jobs(
         RunsFailed: At the end, if jobs failed; at once, if a worker was killed.
     """
     failures = []
-    on_progress("all runs", 0, len(jobs), "")
+    on_progress(ALL_JOBS, 0, len(jobs), "")
     results = _results(executor, function, jobs)
     for number, (name, failure, value) in enumerate(results, 1):
         if failure:
@@ -93,7 +95,7 @@ def run_jobs(
         else:
             keep(jobs[name], value)
             on_progress(name, 1, 1, "done")
-        on_progress("all runs", number, len(jobs), "")
+        on_progress(ALL_JOBS, number, len(jobs), "")
     if failures:
         raise RunsFailed(f"{len(failures)} of {len(jobs)} runs failed: {'; '.join(failures)}")
 

@@ -254,7 +254,7 @@ def _fly_batch(
         frozen = worlds_done(done, drones) if some(done) else None
         ended = np.zeros_like(done)
         while not some(ended):
-            chosen = _act(env, policies, flying)
+            chosen = act_each(env, policies, flying)
             env.advance(chosen, frozen=frozen)
             told.append(env.told())
             seen.append(_seen(env, wanted))
@@ -313,10 +313,12 @@ def _seen(env: AdvancingVectorEnv, wanted: Sequence[str]) -> Mapping[str, Array]
     return {name: seen[name] for name in wanted}
 
 
-def _act(
+def act_each(
     env: AdvancingVectorEnv, policies: Sequence[Policy | None], flying: Sequence[int]
 ) -> Array:
-    """Actions of the drones that fly; 0 for the others."""
+    """Actions of the drones that fly, by their numbers, each by its own policy, or at random where
+    that is None; 0 for the others.
+    """
     space = env.single_action_space
     actions = np.zeros((env.num_envs, *(space.shape or ())), space.dtype)
     for drone in flying:

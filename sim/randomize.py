@@ -1,4 +1,4 @@
-"""Domain randomisation: parameters of a vehicle and its effects, drawn for each episode.
+"""Domain randomisation: what is drawn for each episode, of a vehicle, its effects and its start.
 
 A parameter is a factor of the vehicle's own value, 1 being that value, or a number in its unit.
 """
@@ -14,9 +14,10 @@ from ..models.errors import InputError, shortened
 from ..models.fields import check_names, mapping
 from ..models.files import read_own_toml
 from .effects import EffectOptions
-from .elementary import exp, log
+from .elementary import cos, exp, log, sin
 from .random import Draw
-from .state import ByName, clip
+from .rotations import product
+from .state import Array, ByName, clip, looked_up, parts_of, stack
 
 
 @dataclass(frozen=True)
@@ -42,15 +43,25 @@ LEAST_MASS = 0.1  # share of a mass that is left under any load
 WHOLE = ("action_delay", "observation_delay")
 """Parameters that are whole numbers; a uniform draw gives each the same chance."""
 CHANGE = Parameter(-math.inf, math.inf, "1", "what only changes within an episode; 0 before")
+_SHIFTS = {
+    name: [f"start_{letter}{axis}" for axis in "xyz"]
+    for name, letter in (("position", ""), ("velocity", "v"), ("body_rates", "w"))
+}
+CASE = "case"
+"""Name of the number that says which alternatives an episode has, from 0."""
 _TEXT = re.compile(r"\s*(uniform|loguniform)\s*\(([^()]*)\)\s*")
+
+Distribution = tuple[str, tuple[float, float]]
+"""Its kind, and its ends."""
 
 
 class Randomization:
     """Distributions by the parameter's name, as texts: "uniform(0.8, 1.2)", or a number.
 
-    `uniform(low, high)` and `loguniform(low, high)`; a number stands for itself. Raises
-    `InputError` for anything else, and for a parameter whose effect is off. Effects None: this is
-    not checked.
+    `uniform(low, high)` and `loguniform(low, high)`; a number stands for itself. Alternatives stand
+    between bars, as "1 | uniform(0.8, 1.2)": each episode draws a `case`, the place of the
+    alternative that every parameter with several has. Raises `InputError` for anything else, and
+    for a parameter whose effect is off. Effects None: this is not checked.
 
     `changing`: by how much parameters grow at most within an episode. Those that are not drawn
     begin at the vehicle's own value; they move no random number of the others.
@@ -63,11 +74,17 @@ class Randomization:
         changing: Mapping[str, float] | None = None,
     ) -> None:
         self._changing = changing or {}
-        self._kinds: dict[str, tuple[str, tuple[float, float]]] = {}
+        self._kinds: dict[str, list[Distribution]] = {}
         given = mapping(texts, "randomize", "a mapping from names to distributions")
         check_names(given, PARAMETERS, "randomize")
         for name, text in given.items():
-            self._kinds[name] = _distribution(name, text)
+            parts = text.split("|") if isinstance(text, str) else [text]
+            self._kinds[name] = [_distribution(name, part) for part in parts]
+        counts = {len(kinds) for kinds in self._kinds.values()} - {1}
+        self._cases = max(counts, default=1)
+        if len(counts) > 1:
+            got = " and ".join(map(str, sorted(counts)))
+            raise InputError(f"randomize: expected as many alternatives of each, got {got}")
         for name in (*given, *self._changing):
             needs = PARAMETERS.get(name, CHANGE).needs
             if needs and effects and not any(getattr(effects, effect) for effect in needs):
@@ -81,35 +98,52 @@ class Randomization:
     def names(self) -> tuple[str, ...]:
         """Names of what is drawn, in the order of `PARAMETERS`, and of what else changes."""
         drawn = [name for name in PARAMETERS if name in self._kinds]
-        return (*drawn, *[name for name in self._changing if name not in self._kinds])
+        drawn += [name for name in self._changing if name not in self._kinds]
+        return (*drawn, CASE) if self._cases > 1 else tuple(drawn)
 
     def to_options(self) -> dict[str, float | str]:
         """The distributions by name in canonical form: a number, or a text."""
         options: dict[str, float | str] = {}
-        for name, (kind, numbers) in self._kinds.items():
-            inside = ", ".join(repr(number).removesuffix(".0") for number in numbers)
-            is_one = kind == "uniform" and numbers[0] == numbers[1]
-            options[name] = numbers[0] if is_one else f"{kind}({inside})"
+        for name, kinds in self._kinds.items():
+            texts = [_text(*one) for one in kinds]
+            (_, (low, high)), *others = kinds
+            options[name] = " | ".join(texts) if others or low != high else low
         return options
 
     def most_steps(self, name: str) -> int:
         """Longest delay that can be, control steps; 0 where none is."""
-        _, (_, most) = self._kinds.get(name, ("", (0.0, 0.0)))
+        most = max((high for _, (_, high) in self._kinds.get(name, ())), default=0.0)
         return round(most + self._changing.get(name, 0.0))
+
+    def shares(self, parameters: ByName) -> Array:
+        """Where each of `names` is between the ends of what it may be: -1 to 1, shape (W, A, n)."""
+        parts = []
+        for name in self.names:
+            low, high = self._ends(name)
+            share = 2 * (parameters[name] - low) / max(high - low, 1e-9) - 1
+            parts.append(clip(share, -1.0, 1.0))
+        return stack(parts)
+
+    def _ends(self, name: str) -> tuple[float, float]:
+        if name == CASE:
+            return 0.0, self._cases - 1.0
+        own = 0.0 if PARAMETERS.get(name, CHANGE).unit else 1.0
+        kinds = self._kinds.get(name, [("uniform", (own, own))])
+        ends = [end for _, pair in kinds for end in pair]
+        change = self._changing.get(name, 0.0)
+        return min(ends) + min(change, 0.0), max(ends) + max(change, 0.0)
 
     def draw(self, draw: Draw) -> ByName:
         """Values by name, shape (W, A)."""
         drawn = {}
+        if self._cases > 1:
+            case = np.floor(draw.uniform(0.0, self._cases))
+            drawn[CASE] = np.repeat(case[:, :1], case.shape[1], axis=1)  # alike in a world
         for name in self.names:
-            own = 0.0 if PARAMETERS.get(name, CHANGE).unit else 1.0
-            kind, (low, high) = self._kinds.get(name, ("uniform", (own, own)))
-            if kind == "loguniform":
-                values = exp(draw.uniform(log(low), log(high)))
-            else:
-                spare = 0.5 if name in WHOLE else 0.0  # what is rounded to the ends
-                values = draw.uniform(low - spare, high + spare)
-            values = clip(values, low, high)
-            drawn[name] = np.rint(values) if name in WHOLE else values
+            if name != CASE:
+                own = 0.0 if PARAMETERS.get(name, CHANGE).unit else 1.0
+                kinds = self._kinds.get(name, [("uniform", (own, own))])
+                drawn[name] = _drawn(name, kinds, draw.uniform(0.0, 1.0), drawn.get(CASE))
         return drawn
 
 
@@ -117,7 +151,44 @@ FIXED = Randomization({}, None)
 """Nothing is drawn."""
 
 
-def _distribution(name: str, text: object) -> tuple[str, tuple[float, float]]:
+def moved(start: ByName, drawn: ByName) -> ByName:
+    """A start, arrays by the names of an `InitialState`, that differs by what was drawn."""
+    found = {**start}
+    for name, shifts in _SHIFTS.items():
+        if not drawn.keys().isdisjoint(shifts):
+            found[name] = start[name] + stack([drawn.get(shift, 0.0) for shift in shifts])
+    if "start_tilt" in drawn:
+        half = math.radians(0.5) * drawn["start_tilt"]
+        axis = math.radians(1.0) * drawn.get("start_axis", 0.0)
+        turn = (cos(half), sin(half) * cos(axis), sin(half) * sin(axis), 0.0)
+        found["quaternion"] = stack(product(turn, parts_of(start["quaternion"])))
+    return found
+
+
+def _drawn(name: str, kinds: Sequence[Distribution], share: Array, case: Array) -> Array:
+    """Values at a share of the way between the ends, of the alternative of a case."""
+    spare = 0.5 if name in WHOLE else 0.0  # what is rounded to the ends
+    rows = []
+    for kind, (low, high) in kinds:
+        is_log = kind == "loguniform"
+        first, last = (log(low), log(high)) if is_log else (low - spare, high + spare)
+        rows.append((first, last - first, low, high, is_log))
+    first, way, low, high, is_log = rows[0]
+    if len(rows) > 1:
+        first, way, low, high, is_log = parts_of(looked_up(np.array(rows, float), case))
+    values = first + way * share
+    if any(row[-1] for row in rows):
+        values = np.where(is_log > 0, exp(values), values)
+    values = clip(values, low, high)
+    return np.rint(values) if name in WHOLE else values
+
+
+def _text(kind: str, ends: tuple[float, float]) -> str:
+    low, high = (repr(end).removesuffix(".0") for end in ends)
+    return low if low == high else f"{kind}({low}, {high})"
+
+
+def _distribution(name: str, text: object) -> Distribution:
     limits = PARAMETERS[name]
     match = _TEXT.fullmatch(text) if isinstance(text, str) else None
     kind, inside = match.groups() if match else ("uniform", f"{text},{text}")

@@ -17,7 +17,7 @@ from ..scenes.config import refuse_hidden
 from .compile.llvm import trouble
 from .effects import NO_EFFECTS, EffectOptions, Effects
 from .random import RANDOMIZATION, START, Draw, Random
-from .randomize import CHANGE, FIXED, PARAMETERS, Randomization
+from .randomize import CHANGE, FIXED, PARAMETERS, Randomization, moved
 from .snapshots import Arrays, Kept, Snapshot, joined, part_of
 from .state import FAR, Array, ByName, InitialState, WorldState, chosen, clip
 
@@ -178,11 +178,11 @@ class World(Kept, NotCopied):
         rows = mask[..., None]
         self.random.begin(mask)
         self.scenery.begin(self.random, mask)
+        self._draw_parameters(mask)
         begun = self._begun(mask, pose)
         self._move(begun, mask)
         state.thrust = self._typed(begun["thrust"])
         state.command = np.where(rows, state.thrust, state.command)
-        self._draw_parameters(mask)
         self._vary(self.parameters)
         thrust = self.effects.begin(mask, state, self.parameters)
         state.thrust = self._typed(np.where(rows, thrust, state.thrust))
@@ -330,8 +330,9 @@ class World(Kept, NotCopied):
         begun = {}
         for name, default in usual.items():
             given = getattr(pose, name)
-            old = getattr(self.state, name)
-            begun[name] = np.where(mask[..., None], default if given is None else given, old)
+            begun[name] = default if given is None else given
+        for name, start in moved(begun, self.parameters).items():
+            begun[name] = np.where(mask[..., None], start, getattr(self.state, name))
         return begun
 
 

@@ -20,6 +20,7 @@ from ..agents import (
 )
 from ..agents.presets import PresetName
 from ..envs.config import DEFAULT_ENV, EnvConfig, read_keywords, source_hash
+from ..envs.perturbations import for_training
 from ..envs.registry import env_spec, load
 from ..envs.spec import json_values
 from ..flights.trajectories import EpisodeSet
@@ -180,8 +181,12 @@ class Row:
     def run(self, seed: int) -> Run:
         """The training of a seed."""
         backend = replace(self.env.backend, name=self.backend or self.env.backend.name)
+        env = replace(self.env, backend=backend)
+        found = find_preset(self.agent, self.preset, self.env.env_id)
+        if found.perturbations:
+            env, _ = for_training(env, found.perturbations)
         return Run(
-            env=replace(self.env, backend=backend),
+            env=env,
             algorithm=self.agent,
             config=self.config,
             seed=seed,

@@ -241,7 +241,7 @@ class _Program:
         self.lines += [loop, f"    {statement}"]
 
     def scaling(self, layer: Scaling) -> None:
-        """Distances and pictures as networks see them, in a copy of the observation."""
+        """Distances, pictures and lengths as networks see them, in a copy of the observation."""
         seen = self._array(self.size)
         self._each(f"{seen}[i] = observation[i];")
         for place in layer.pictures:
@@ -249,6 +249,9 @@ class _Program:
         for place in layer.distances:
             self._each(f"{seen}[i] = {seen}[i] < 0.0f ? 0.0f : 0.5f * {seen}[i];", place)
             self._each(f"{seen}[i] = 2.0f / (1.0f + {seen}[i]) - 0.5f;", place)
+        for place in layer.lengths:
+            size = f"({seen}[i] < 0.0f ? -{seen}[i] : {seen}[i])"
+            self._each(f"{seen}[i] /= 1.0f + {size} / {layer.reach}f;", place)
 
     def _act(self, policy: NetworkPolicy) -> None:
         """Map the outputs to the range of the action, and clip them to its bounds."""

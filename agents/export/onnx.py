@@ -91,8 +91,9 @@ class _Graph:
         self.nodes[-1].output[0] = self.at = "next_state"
 
     def scaling(self, layer: Scaling) -> None:
-        """2 m / (1 + m x / 2) - m / 2 + f x, where m is 1 and f is 0 for a distance, m is 0 and f
-        is 1 / 255 for a picture, or 1.
+        """2 m / (1 + m x / 2) - m / 2 + f x / (1 + |l x|), where m is 1 and f is 0 for a distance;
+        for others m is 0, and f is 1 / 255 for a picture, or 1; l is one over the reach of a
+        length, or 0.
 
         A distance below 0 counts as 0.
         """
@@ -102,6 +103,9 @@ class _Graph:
         factor = np.float32(1.0) - mask
         for place in layer.pictures:
             factor[:, place] /= BRIGHTEST
+        softer = np.zeros_like(mask)
+        for place in layer.lengths:
+            softer[:, place] = 1.0 / layer.reach
         half = np.float32(0.5)
         self.then("Mul", half * mask)
         self.then("Relu")
@@ -110,7 +114,12 @@ class _Graph:
         self.then("Mul", mask / half)
         seen = self.then("Add", -half * mask)
         self.at = "observation"
-        others = self.then("Mul", factor)
+        self.then("Mul", softer)
+        self.then("Abs")
+        softened = self.then("Add", np.ones_like(mask))
+        self.at = "observation"
+        self.then("Mul", factor)
+        others = self.node("Div", self.at, softened)
         self.node("Add", seen, others)
 
     def _kept(self, constant: np.ndarray) -> str:

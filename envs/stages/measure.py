@@ -4,13 +4,15 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ...sim import World
+from ...models.errors import InputError
+from ...sim import Randomization, World
 from ...sim.sensors import Sensors
 from ...sim.snapshots import Arrays
 from ..spec import ArraySpec
 from ..state import kept_state, read_only
 from .record import Record, Stage
 
+_DRAWN = "drawn"
 _ESTIMATED = ("position", "quaternion", "velocity", "body_rates")
 
 
@@ -88,3 +90,30 @@ class Readings(Stage):
         for name, (low, high) in self._bounds.items():
             observations[name] = np.clip(observations[name], low, high)
         record.observations = observations
+
+
+@dataclass
+class Drawn(Stage):
+    """Adds what is drawn to the observation, as `drawn_array` says."""
+
+    world: World
+    """Its parameters."""
+
+    def step(self, record: Record) -> None:
+        """What the next step is flown with."""
+        drawn = self.world.randomize.shares(self.world.parameters)
+        record.observations = {**record.observations, _DRAWN: drawn}
+
+
+def drawn_array(drawn: Randomization) -> ArraySpec:
+    """The spec of what is drawn, each between its ends. Raises `InputError` where nothing is."""
+    if not drawn.names:
+        raise InputError("observe_drawn: expected something in randomize or events, got nothing")
+    return ArraySpec(
+        name=_DRAWN,
+        shape=(len(drawn.names),),
+        low=-1.0,
+        high=1.0,
+        components=drawn.names,
+        privileged=True,
+    )

@@ -107,8 +107,13 @@ class NumbersTask(Task):
         self._bounds = array.bounds()
 
     def crashed(self, state: State, outside: Array) -> Array:
-        """Whether drones are outside of their band, touch anything, or flipped over, (W, A)."""
-        return outside | state.touching | (state.tilt_cosine < LEAST_TILT_COSINE)
+        """Whether drones are outside of their band, touch anything, or flipped over, (W, A).
+
+        An episode that begins tilted further, by the parameter `start_tilt`, may tilt further.
+        """
+        further = state.parameters.get("start_tilt", 0.0)
+        least = LEAST_TILT_COSINE - sin(math.radians(1.0) * np.minimum(further, 90.0))
+        return outside | state.touching | (state.tilt_cosine < least)
 
 
 class GoalTask(NumbersTask):

@@ -206,3 +206,29 @@ def test_distances_come_in_as_nearness() -> None:
     theirs = tensor.grad
     assert theirs is not None
     np.testing.assert_allclose(back, theirs.numpy().T, rtol=1e-4, atol=1e-5)
+
+
+def test_lengths_come_in_softened() -> None:
+    units = ("m", "m/s", "m")
+    seen = ArraySpec(name="seen", shape=(3,), low=-9.0, high=9.0, unit=units)
+    height = ArraySpec(name="height", shape=(1,), low=0.0, high=9.0, unit="m")
+    last = ArraySpec(name="last", shape=(2,), low=-9.0, high=9.0, unit="m")
+    network = Network([seen, height, last], 2, config_of((4,), "tanh", reach=2.0))
+    weights = bound(network)
+    weights.values[:] = normal(weights.values.size)
+    inputs = normal(6, BATCH) * 3.0
+    tensor = torch.tensor(inputs.T, requires_grad=True)
+    is_length = torch.tensor([True, False, True, False, True, True])
+    softened = tensor / (1 + tensor.abs() / 2)
+    arrays = tensors(weights)
+    outputs = torch_mlp(arrays, torch.where(is_length, softened, tensor), "tanh")
+    got = network.forward(inputs)
+    np.testing.assert_allclose(got, outputs.detach().numpy().T, rtol=1e-5, atol=1e-6)
+    slope = normal(2, BATCH)
+    outputs.backward(torch.tensor(slope.T))
+    network.learn(slope.copy())
+    agree(weights, arrays)
+    network.forward(inputs)
+    assert tensor.grad is not None
+    theirs = tensor.grad.numpy().T
+    np.testing.assert_allclose(network.back(slope.copy()), theirs, rtol=1e-4, atol=1e-5)

@@ -78,7 +78,7 @@ def test_the_tuned_preset_depends_on_the_task() -> None:
     for algorithm in ("ppo", "mappo", "sb3-ppo"):
         crossing = find_preset(algorithm, "tuned", "rotorgram/Crossing-v0")
         assert crossing == replace(swarm, env_id="rotorgram/Crossing-v0")
-    with pytest.raises(InputError, match="preset: expected tuned for ppo, got 'paper'"):
+    with pytest.raises(InputError, match="preset: expected robust or tuned for ppo, got 'paper'"):
         find_preset("ppo", "paper")
 
 

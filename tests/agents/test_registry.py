@@ -121,7 +121,9 @@ def test_a_network_of_one_s_own_trains_resumes_and_loads(
 
 
 def test_sb3_takes_its_own_networks_alone() -> None:
-    with pytest.raises(InputError, match="network: expected mlp without memory with SB3, got"):
+    with pytest.raises(
+        InputError, match="network: expected mlp without memory and reach with SB3, got"
+    ):
         make_agent("sb3-ppo", EpisodeRecorder(vector(), 0), PPOConfig(network="wide"), 0)
 
 

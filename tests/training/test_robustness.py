@@ -1,0 +1,85 @@
+"""The table of robustness: its cells, its flights, its numbers, and the command that writes it."""
+
+import json
+from pathlib import Path
+
+import pandas as pd
+import pytest
+from rotorgram.cli import main
+from rotorgram.envs.config import EnvConfig
+from rotorgram.envs.perturbations import PERTURBATIONS
+from rotorgram.flights.executors import WorkersConfig
+from rotorgram.training import robustness
+from rotorgram.training.robustness import NOMINAL, TOGETHER, Cell, cells_of, fly, jobs_of, table_of
+
+CONFIG = EnvConfig.from_keywords(
+    "rotorgram/Hover-v0", vehicle="hummingbird", backend="rigid", action="position",
+    episode_length=60,
+)  # fmt: skip
+
+
+def test_cells_of_a_craft_and_what_it_cannot_fly() -> None:
+    cells, refused = cells_of(CONFIG)
+    rows = list(dict.fromkeys(cell.row for cell in cells))
+    assert rows == [NOMINAL, *(name for name in PERTURBATIONS if name not in refused), TOGETHER]
+    assert refused["obstacles"] == "rotorgram/Hover-v0: expected a task with density, it has none"
+    assert "rotors.curve" in refused["curve"]
+    sizes = [cell.size for cell in cells if cell.row == "wind"]
+    assert sizes == [2, 5, 8]
+    last = cells[-1]
+    assert last.drawn["mass"] == "uniform(0.5, 1.5)"
+    assert last.drawn["start_tilt"] == "uniform(0, 180.0)"
+    assert last.config.effects.motor_lag
+    labels = [cell.label for cell in cells]
+    assert len(set(labels)) == len(labels)
+    assert {"nominal", "wind 5 m/s", "all together, 3 of 3"} <= {*labels}
+
+
+def test_cells_of_one_env_fly_together_and_keep_their_own_numbers() -> None:
+    cells = [cell for cell in cells_of(CONFIG)[0] if cell.row in (NOMINAL, "rotor", "wind")]
+    jobs = jobs_of("geometric", cells, 30)
+    assert [len(job.cells) for job in jobs] == [4, 3]
+    flown = fly(jobs, WorkersConfig(jobs=1), lambda *_: None)
+    assert len(flown) == 30 * len(cells)
+    assert flown.groupby(["row", "size"])["seed"].nunique().eq(30).all()
+    table = table_of(flown, cells).set_index(["row", "size"])
+    assert list(table["flights"]) == [30] * len(cells)
+    errors = table.loc["rotor", "median"]
+    assert errors[10] < errors[20] < errors[30]
+    again = fly(jobs[:1], WorkersConfig(jobs=1), lambda *_: None)
+    pd.testing.assert_frame_equal(again, flown.head(len(again)))
+
+
+def test_a_cell_has_wilson_s_interval_and_the_errors_of_whole_flights() -> None:
+    cell = Cell(row=NOMINAL, size=0.0, config=CONFIG, drawn={})
+    flown = pd.DataFrame({"crashed": [True] + [False] * 9, "steady": [9.0, *range(1, 10)]})
+    flown = flown.assign(pilot="p", row=NOMINAL, size=0.0)
+    line = table_of(flown, [cell]).iloc[0]
+    assert (line["flights"], line["crashes"], line["median"]) == (10, 1, 5.0)
+    # Wilson's interval of 1 of 10: (0.0179, 0.4042).
+    assert line["low"] == pytest.approx(0.0179, abs=1e-4)
+    assert line["high"] == pytest.approx(0.4042, abs=1e-4)
+
+
+def test_the_command_writes_table_figure_and_flights(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    few = {name: PERTURBATIONS[name] for name in ("rotor", "curve")}
+    monkeypatch.setattr(robustness, "PERTURBATIONS", few)
+    out = tmp_path / "a folder"
+    words = ["evaluate", "geometric", "--env", "rotorgram/Hover-v0", "--vehicle", "hummingbird"]
+    words += ["--episode-length", "50", "--robustness", "--episodes", "8", "--jobs", "1"]
+    assert main([*words, "--out", str(out)]) == 0
+    text = capsys.readouterr().out
+    assert "one rotor weaker 30 %" in text
+    assert "not flown: thrust by the curve: vehicle: expected rotors.curve" in text
+    content = json.loads((out / "robustness.json").read_text())
+    flights = pd.read_csv(out / "flights.csv.gz")
+    for cell in content["cells"]:
+        own = flights[(flights["row"] == cell["row"]) & (flights["size"] == cell["size"])]
+        assert (len(own), own["crashed"].sum()) == (cell["flights"], cell["crashes"])
+    assert (out / "robustness.png").stat().st_size > 10_000
+    assert main([*words, "--out", str(out)]) == 1
+    assert "out: expected a new folder" in capsys.readouterr().err
+    assert main(["evaluate", "pid", "--out", str(out)]) == 1
+    assert "out, jobs: expected them with --robustness" in capsys.readouterr().err
