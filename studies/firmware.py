@@ -23,7 +23,7 @@ from measuring import RESULTS, options, write
 
 TASK: Final = ("--vehicle", "crazyflie2", "--env", "rotorgram/Hover-v0")
 LAG: Final = ("--effects", "motor_lag")
-TRAIN: Final = ("train", "ppo", *TASK, "--env-steps", "1000000")
+TRAIN: Final = ("train", "ppo", "--preset", "tuned", *TASK, "--env-steps", "1000000")
 FLY: Final = ("fly", "crazyflie", "--mode", "policy", *TASK, *LAG)
 TRIES: Final = 20
 STUB: Final = Path(__file__).parents[1] / "tests" / "data" / "crazyflie_stub"

@@ -91,7 +91,8 @@ def test_a_training_goes_on_with_the_settings_of_its_backend(
 def test_a_training_without_the_lag_of_its_rotors_is_noted(
     words: tuple[str, ...], notes: int, tmp_path: Path, capsys: Capsys
 ) -> None:
-    task = ("ppo", "--env", "rotorgram/Hover-v0", *LEAST, "--out", tmp_path / "run")
+    hover = ("--preset", "tuned", "--env", "rotorgram/Hover-v0")
+    task = ("ppo", *hover, *LEAST, "--out", tmp_path / "run")
     out = trained(capsys, *task, *words)
     note = (
         "note: the rotors of Crazyflie 2.x follow with a time constant of 0.072 s, "
