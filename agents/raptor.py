@@ -1,0 +1,135 @@
+"""RAPTOR: a recurrent policy by others, which infers the quadcopter that it flies."""
+
+from collections.abc import Mapping
+from itertools import permutations
+from typing import ClassVar
+
+import numpy as np
+
+from ..envs.spec import EnvSpec
+from ..models.errors import InputError, require
+from .layers import Floats
+from .policies import Array, Observation, flat
+
+CORNERS = np.array((1 - 1j, -1 - 1j, -1 + 1j, 1 + 1j)) / np.sqrt(2)
+"""Directions, x + iy, of its motors: front right, rear right, rear left, front left."""
+TURNS = (-1, 1, -1, 1)
+"""Signs of the torques of its motors about body z, at a thrust."""
+ALIKE = 0.8  # least likeness of a layout of rotors to its own, 1 for a square
+LEAST_TURN = 1 - 1e-6j  # of two that are as large, that to the left
+PERIOD = 0.01  # s, between its actions
+LIMITS = np.array(((1.0,), (2.0,)))
+"""Largest position, m, and velocity, m/s, from those of the goal: it was trained on such."""
+BEYOND = 0.15  # m, that it aims past a gate and below a pad: it stops some centimetres short
+_VECTORS = ("goal - position", "velocity", "body rate")
+_PAD = "velocity of the pad"
+_GATE = "direction of the gate"
+_FURTHER = ("nose", "thrust axis", "up", "reference velocity", _PAD, _GATE)
+
+
+class Raptor:
+    """Flies a quadcopter to the goal of a task by its rotors, at 100 Hz.
+
+    J. Eschmann, D. Albani, G. Loianno, "RAPTOR: A Foundation Policy for Quadrotor Control", 2025.
+    The package `foundation-policy` (MIT) has the weights and their forward pass. The policy takes
+    position from the goal and velocity from that of the goal, both cut, attitude, body rates and
+    its last action; it gives throttles, from -1 to 1.
+
+    It knows one order of rotors, in which the front right one turns counterclockwise. So world and
+    body are turned about z until the craft's rotors are in that order. Where the observation is in
+    the body frame, with `up` in place of nose and thrust axis, the nose always has the heading 0.
+
+    Raises `InputError` for an env that lacks what it needs, `MissingPackage` without its package.
+    """
+
+    options: ClassVar[Mapping[str, object]] = {"action": "rotors", "control_period": PERIOD}
+    """Options of the env that it flies."""
+
+    def __init__(self, spec: EnvSpec) -> None:
+        self._at = spec.vectors("raptor", _VECTORS, _FURTHER)
+        if spec.control_period != PERIOD:
+            raise InputError(
+                f"raptor: expected a control period of {PERIOD} s (--control-period {PERIOD}), "
+                f"got {spec.control_period} s"
+            )
+        numbers = {name: np.array(value) for name, value in spec.constants.items()}
+        if "throttle_curve" not in numbers:
+            raise InputError(
+                "raptor: expected actions of the level rotors (--action rotors) of one vehicle, "
+                f"got {spec.vehicle} with the constants {', '.join(numbers)}"
+            )
+        levels = [numbers[f"thrust_{level}"] for level in ("low", "hover", "high")]
+        self._thrusts = np.stack(levels, axis=1)
+        self._curve = numbers["throttle_curve"][::-1]
+        self._order, turn = layout(*(numbers[f"torque_{axis}"] for axis in "xyz"))
+        ahead = np.array((turn.real, turn.imag, 0.0))
+        self._frame = triad(ahead, np.eye(3)[2]).T
+        self._spec = spec
+        self._policy = require("foundation_policy", "raptor", "raptor").Raptor()
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget the last episode, and the craft."""
+        self._policy.reset()
+        self._last = np.zeros(4)
+
+    def act(self, observation: Observation) -> Floats:
+        """Action of the level `rotors`, float32, shape (4,)."""
+        numbers = flat(observation, self._spec).astype(np.float64)
+        now = {name: numbers[at] for name, at in self._at.items()}
+        goal = now["goal - position"]
+        velocity = now["velocity"] - now.get("reference velocity", 0.0)
+        if _GATE in now:
+            goal[: len(now[_GATE])] += BEYOND * now[_GATE]
+        if _PAD in now:
+            goal[2] -= BEYOND
+            velocity[:2] -= now[_PAD]
+        vectors = np.array((-goal, velocity))
+        if "up" in now:
+            up = now["up"]
+            level = (1.0, 1e-9, 0.0) - up[0] * up  # never 0
+            axes = triad(level / np.linalg.norm(level), up)
+            vectors @= axes.T
+        else:
+            axes = triad(now["nose"], now["thrust axis"]).T
+        frame = self._frame
+        vectors /= np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True) / LIMITS, 1.0)
+        position, velocity = vectors @ frame
+        attitude = (frame.T @ axes @ frame).ravel()
+        inputs = (position, attitude, velocity, now["body rate"] @ frame, self._last)
+        (motors,) = self._policy.evaluate_step(np.concatenate(inputs)[None])
+        self._last = np.clip(motors, -1.0, 1.0)
+        throttles = np.zeros(4)
+        throttles[self._order] = 0.5 + 0.5 * self._last
+        thrusts = self._thrusts[:, 2] * np.polyval(self._curve, throttles)
+        pairs = zip(thrusts, self._thrusts, strict=True)
+        action = [np.interp(thrust, levels, (-1.0, 0.0, 1.0)) for thrust, levels in pairs]
+        return np.array(action, np.float32)
+
+
+def triad(x: Array, z: Array) -> Array:
+    """Rows x, y and z of right angles, (3, 3)."""
+    return np.array((x, np.cross(z, x), z))
+
+
+def layout(roll: Array, pitch: Array, yaw: Array) -> tuple[list[int], complex]:
+    """Which rotor each motor is, and the turn of the frame about z, as e^(iθ), in which they are in
+    its corners.
+
+    Torques about the center of mass are per newton of each rotor, m, shape (R,). Raises
+    `InputError` unless there are four rotors, one in each corner, and neighbours turn against each
+    other.
+    """
+    place = 1j * roll - pitch
+    fits = []
+    for order in map(list, permutations(range(len(place)), 4)):
+        fit = np.vdot(CORNERS, place[order]) / np.abs(place).sum()
+        if (np.sign(yaw[order]) == TURNS).all() and abs(fit) > ALIKE:
+            fits.append((fit, order))
+    if not fits:
+        raise InputError(
+            "raptor: expected four rotors, one in each corner, neighbours of which turn against "
+            f"each other, got {len(place)} with the torques {np.round(yaw, 4).tolist()} about z"
+        )
+    fit, order = max(fits, key=lambda one: float((one[0] * LEAST_TURN).real))
+    return order, complex(fit / abs(fit))
