@@ -1,8 +1,7 @@
 """RAPTOR: a recurrent policy by others, which infers the quadcopter that it flies."""
 
 from collections.abc import Mapping
-from itertools import permutations
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -11,11 +10,10 @@ from ..models.errors import InputError, require
 from .layers import Floats
 from .policies import Array, Observation, flat
 
-CORNERS = np.array((1 - 1j, -1 - 1j, -1 + 1j, 1 + 1j)) / np.sqrt(2)
+CORNERS = 1j ** np.array((-0.5, -1.5, 1.5, 0.5))
 """Directions, x + iy, of its motors: front right, rear right, rear left, front left."""
 TURNS = (-1, 1, -1, 1)
 """Signs of the torques of its motors about body z, at a thrust."""
-ALIKE = 0.8  # least likeness of a layout of rotors to its own, 1 for a square
 LEAST_TURN = 1 - 1e-6j  # of two that are as large, that to the left
 PERIOD = 0.01  # s, between its actions
 LIMITS = np.array(((1.0,), (2.0,)))
@@ -47,21 +45,17 @@ class Raptor:
 
     def __init__(self, spec: EnvSpec) -> None:
         self._at = spec.vectors("raptor", _VECTORS, _FURTHER)
-        if spec.control_period != PERIOD:
-            raise InputError(
-                f"raptor: expected a control period of {PERIOD} s (--control-period {PERIOD}), "
-                f"got {spec.control_period} s"
-            )
         numbers = {name: np.array(value) for name, value in spec.constants.items()}
-        if "throttle_curve" not in numbers:
+        if spec.control_period != PERIOD or "throttle_curve" not in numbers:
             raise InputError(
-                "raptor: expected actions of the level rotors (--action rotors) of one vehicle, "
-                f"got {spec.vehicle} with the constants {', '.join(numbers)}"
+                "raptor: expected one vehicle, --action rotors and --control-period 0.01, got "
+                f"{spec.vehicle}, {', '.join(spec.action.components)} and {spec.control_period}"
             )
         levels = [numbers[f"thrust_{level}"] for level in ("low", "hover", "high")]
         self._thrusts = np.stack(levels, axis=1)
         self._curve = numbers["throttle_curve"][::-1]
-        self._order, turn = layout(*(numbers[f"torque_{axis}"] for axis in "xyz"))
+        order, turn = layout(*(numbers[f"torque_{axis}"] for axis in "xyz"))
+        self._motors = np.argsort(order)
         ahead = np.array((turn.real, turn.imag, 0.0))
         self._frame = triad(ahead, np.eye(3)[2]).T
         self._spec = spec
@@ -99,8 +93,7 @@ class Raptor:
         inputs = (position, attitude, velocity, now["body rate"] @ frame, self._last)
         (motors,) = self._policy.evaluate_step(np.concatenate(inputs)[None])
         self._last = np.clip(motors, -1.0, 1.0)
-        throttles = np.zeros(4)
-        throttles[self._order] = 0.5 + 0.5 * self._last
+        throttles = 0.5 + 0.5 * self._last[self._motors]
         thrusts = self._thrusts[:, 2] * np.polyval(self._curve, throttles)
         pairs = zip(thrusts, self._thrusts, strict=True)
         action = [np.interp(thrust, levels, (-1.0, 0.0, 1.0)) for thrust, levels in pairs]
@@ -112,24 +105,26 @@ def triad(x: Array, z: Array) -> Array:
     return np.array((x, np.cross(z, x), z))
 
 
-def layout(roll: Array, pitch: Array, yaw: Array) -> tuple[list[int], complex]:
-    """Which rotor each motor is, and the turn of the frame about z, as e^(iθ), in which they are in
-    its corners.
+def layout(roll: Array, pitch: Array, yaw: Array) -> tuple[Any, Any]:
+    """Which rotor each motor is, ints, (4,), and by how much the frame is turned about z in which
+    they are in its corners, as e^(iθ).
 
     Torques about the center of mass are per newton of each rotor, m, shape (R,). Raises
     `InputError` unless there are four rotors, one in each corner, and neighbours turn against each
     other.
     """
     place = 1j * roll - pitch
-    fits = []
-    for order in map(list, permutations(range(len(place)), 4)):
-        fit = np.vdot(CORNERS, place[order]) / np.abs(place).sum()
-        if (np.sign(yaw[order]) == TURNS).all() and abs(fit) > ALIKE:
-            fits.append((fit, order))
+    clockwise = np.argsort(-np.angle(place))
+    orders = [np.roll(clockwise, -first) for first in range(len(place))]
+    fits = [
+        (np.vdot(CORNERS, place[order]), order)
+        for order in orders
+        if np.array_equal(np.sign(yaw[order]), TURNS)
+    ]
     if not fits:
         raise InputError(
             "raptor: expected four rotors, one in each corner, neighbours of which turn against "
             f"each other, got {len(place)} with the torques {np.round(yaw, 4).tolist()} about z"
         )
     fit, order = max(fits, key=lambda one: float((one[0] * LEAST_TURN).real))
-    return order, complex(fit / abs(fit))
+    return order, fit / abs(fit)
