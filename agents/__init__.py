@@ -1,4 +1,4 @@
-"""Learning algorithms, their policies and files, and controllers: PID and geometric.
+"""Learning algorithms, their policies and files, and controllers: PID, geometric and RAPTOR.
 
 Only SB3's algorithms need torch. Each name is imported when it is first used.
 """

@@ -11,6 +11,7 @@ from ..models.user_code import load_class, names_class
 from .geometric import Geometric
 from .pid import PID
 from .policies import Policy
+from .raptor import Raptor
 
 
 class Controller(Policy, Protocol):
@@ -23,7 +24,11 @@ class Controller(Policy, Protocol):
         """Raises `InputError` for an env that it cannot fly."""
 
 
-CONTROLLERS: Mapping[str, type[Controller]] = {"pid": PID, "geometric": Geometric}
+CONTROLLERS: Mapping[str, type[Controller]] = {
+    "pid": PID,
+    "geometric": Geometric,
+    "raptor": Raptor,
+}
 _NEEDED = ("options", "reset", "act")
 
 

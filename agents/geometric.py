@@ -50,19 +50,8 @@ class Geometric:
         self._gravity = spec.constant("gravity", "geometric")
         self._scale = spec.action_scale
         seen = [name for array in spec.observation for name in component_names(array)]
-        places = {name: place for place, name in enumerate(seen)}
-        self._at: dict[str, list[int]] = {}
-        for vector in (*_VECTORS, *_PAYLOAD):
-            components = [f"{vector} {axis}" for axis in "xyz"]
-            if places.keys() >= {*components}:
-                self._at[vector] = [places[name] for name in components]
-        for vector in _VECTORS:
-            if vector not in self._at:
-                raise InputError(
-                    f"geometric: expected the observation '{vector} x', "
-                    f"got {spec.env_id} without it"
-                )
-        self._rotors = [place for name, place in places.items() if name.endswith(" over hover")]
+        self._at = spec.vectors("geometric", _VECTORS, _PAYLOAD)
+        self._rotors = [i for i, name in enumerate(seen) if name.endswith(" over hover")]
         self._swing: Array | None = None
         self._pull = 0.0  # of the payload on the craft, m/s² per m that it hangs aside
         share = spec.options.get("payload_share")

@@ -8,8 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..envs.config import EnvConfig
-from ..envs.spec import EnvSpec, component_names
-from ..models import InputError, Vehicle
+from ..envs.spec import EnvSpec
+from ..models import Vehicle
+from ..sim.control import throttle_curve
+from ..sim.effects import NO_EFFECTS
 from ..sim.rotations import axes_of
 from ..sim.sensors import SENSOR_TYPES
 
@@ -70,9 +72,8 @@ class Propellers:
     """
 
     def __init__(self, config: EnvConfig, vehicle: Vehicle) -> None:
-        curve = vehicle.coefficients["rotors.curve"] or (0.0, 0.0, 1.0)
-        own = np.polynomial.Polynomial(curve)
-        self._asked = (1.0, 0.0) if config.effects.thrust_curve else curve[::-1]
+        own = np.polynomial.Polynomial(throttle_curve(vehicle, NO_EFFECTS))
+        self._asked = np.array(throttle_curve(vehicle, config.effects)[::-1])
         self._high = vehicle.thrust_high
         self._throttles = np.linspace(0.0, 1.0, 1025)
         self._shares = own(self._throttles)
@@ -101,16 +102,8 @@ class Instruments:
 
     def __init__(self, spec: EnvSpec) -> None:
         self._gravity = spec.constant("gravity", "autopilot")
-        first = spec.observation[0]
-        self._array = first.name
-        names = component_names(first)
-        wanted = [f"{guide} {axis}" for guide in _GUIDES for axis in "xyz"]
-        for name in wanted:
-            if name not in names:
-                raise InputError(
-                    f"autopilot: expected a task that observes '{name}', got {spec.env_id}"
-                )
-        self._at = [names.index(name) for name in wanted]
+        self._array = spec.observation[0].name
+        self._at = np.concatenate([*spec.vectors("autopilot", _GUIDES).values()])
 
     def reading(self, observation: Mapping[str, Floats], time: float) -> Reading:
         """Of a craft that flies."""

@@ -28,8 +28,8 @@ class Compare(StudyFlags):
     """TOML files: of one row (agent, env, set, …), named by its file, or of [[row]] tables. They
     train in this process, unless --udp is given."""
     agents: tuple[str, ...] = ("vpg", "a2c", "sb3-a2c")
-    """Algorithms to train without files, and controllers: geometric, FILE.py:CLASS. The PID flies
-    beside them where it can."""
+    """Algorithms to train without files, and controllers: geometric, raptor, FILE.py:CLASS. The PID
+    flies beside them where it can."""
     udp: bool = True
     """Whether each of them trains over UDP, with a simulator process of its own. The numbers are
     the same without, but for the times."""

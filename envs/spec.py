@@ -300,6 +300,26 @@ class EnvSpec(_Part):
             raise InputError(f"{user}: expected the constant {name!r} in the spec, got {value!r}")
         return value
 
+    def vectors(
+        self, user: str, needed: Sequence[str], further: Sequence[str] = ()
+    ) -> dict[str, list[int]]:
+        """Where components x, y and z of vectors are in a flat observation, by name.
+
+        Raises `InputError`, which names the `user`, if a needed vector is not there. Of the further
+        ones those that are not are left out, and one may lack z.
+        """
+        names = [name for array in self.observation for name in component_names(array)]
+        at = {}
+        for vector in (*needed, *further):
+            found = [names.index(n) for axis in "xyz" if (n := f"{vector} {axis}") in names]
+            if found:
+                at[vector] = found
+            elif vector in needed:
+                raise InputError(
+                    f"{user}: expected the observation '{vector} x', got {self.env_id} without it"
+                )
+        return at
+
     def check_telemetry(self, names: Sequence[str], user: str) -> None:
         """Raise `InputError`, which names the `user`, if these are not all in the telemetry."""
         missing = set(names).difference(array.name for array in self.telemetry)

@@ -4,6 +4,7 @@ from ..models.cameras import chosen_views
 from ..models.errors import InputError
 from ..models.swarm import drone_names
 from ..sim import Controller
+from ..sim.control import RotorThrust, rotor_constants
 from ..sim.sensors import range_sensors_of, readings_of
 from ..sim.sensors.instruments import Instrument
 from ..sim.sensors.range_sensors import RangeSensor
@@ -64,6 +65,9 @@ def spec_of(config: EnvConfig, task: Task) -> EnvSpec:
             axes=sensor.axes,
         )
         observation.append(array)
+    constants = getattr(task.controller, "constants", {})
+    if isinstance(task.controller, RotorThrust):
+        constants = rotor_constants(task.vehicle, config.effects)
     return EnvSpec(
         env_id=config.env_id,
         options=config.flat_options(),
@@ -79,7 +83,7 @@ def spec_of(config: EnvConfig, task: Task) -> EnvSpec:
         constants={
             "gravity": task.vehicle.gravity,
             "radius": task.vehicle.radius,
-            **getattr(task.controller, "constants", {}),
+            **constants,
         },
         marks=task.marks,
         asks=asks_of(config.events),

@@ -64,7 +64,7 @@ STACKS = {
     "crazyflie-mellinger": ("crazyflie", "mellinger"),
     "ardupilot": ("ardupilot", "guided"),
 }
-CONTROLLERS = {"geometric": "geometric", "raptor": "examples/raptor.py:Raptor"}
+CONTROLLERS = ("geometric", "raptor")
 PILOTS: tuple[str, ...] = (*CONTROLLERS, "ppo", *STACKS)
 RESAMPLES = 10_000
 
@@ -194,7 +194,7 @@ class Pilots:
                 raise ValueError(f"{name}: expected a program")
             return of_stack(case, name, program)
         if name in CONTROLLERS:
-            kind = find_controller(CONTROLLERS[name])
+            kind = find_controller(name)
             return of_ours(case, kind.options, kind)
         if case.task not in self._policies:
             self._policies[case.task] = trained(case.task, self._vehicle, self._folder / case.task)

@@ -28,6 +28,10 @@ thrust, roll, pitch and yaw rate; velocity and yaw rate; position and heading; a
 thrusts; all thrusts."""
 SHARES = {"increment": 0.05, "offset": 0.2}
 """Thrust of one unit of action over the rotors' largest thrust."""
+_CONSTANTS = (
+    "thrust_low", "thrust_hover", "thrust_high", "torque_x", "torque_y", "torque_z",
+    "throttle_curve",
+)  # fmt: skip
 
 
 class Controller(Protocol):
@@ -165,6 +169,22 @@ def make_controller(
     drones = [[i for i, own in enumerate(members) if own is kind] for kind in kinds]
     mixed = MixedController(list(zip(controllers, drones, strict=True)))
     return cast(Controller, mixed)
+
+
+def rotor_constants(vehicle: "models.Vehicle", effects: EffectOptions) -> dict[str, Numbers]:
+    """What an agent needs to know of the rotors, by name: `docs/protocol.md` has the units."""
+    thrusts = (vehicle.thrust_low, vehicle.hover_thrust, vehicle.thrust_high)
+    rows = [tuple(row.tolist()) for row in (*thrusts, *vehicle.allocation[1:])]
+    return dict(zip(_CONSTANTS, (*rows, throttle_curve(vehicle, effects)), strict=True))
+
+
+def throttle_curve(vehicle: "models.Vehicle", effects: EffectOptions) -> Numbers:
+    """Coefficients c₀, c₁, ... of a command over the rotors' largest at a throttle of 0 to 1.
+
+    The vehicle's curve, or else the square; where the effect has the curve, the throttle itself.
+    """
+    curve: Numbers = vehicle.coefficients["rotors.curve"] or (0.0, 0.0, 1.0)
+    return (0.0, 1.0) if effects.thrust_curve else tuple(curve)
 
 
 def lag_of(vehicle: "models.Vehicle", effects: EffectOptions) -> float:

@@ -204,5 +204,5 @@ def test_a_mode_of_another_stack_is_refused():
 
 
 def test_a_task_without_a_goal_is_refused():
-    with pytest.raises(InputError, match="observes 'nose x', got rotorgram/Recovery-v0"):
+    with pytest.raises(InputError, match="the observation 'nose x', got rotorgram/Recovery-v0"):
         flown([], "rotorgram/Recovery-v0")

@@ -70,9 +70,8 @@ def test_a_clone_flies_as_the_pilot_of_a_journal(tmp_path: Path) -> None:
 
 def test_every_script_is_run() -> None:
     scripts = {path.name for path in EXAMPLES.glob("*.py")}
-    # test_own_task.py, test_capture.py, test_datasets.py, test_swarm_tasks.py, test_vfh.py,
-    # test_raptor.py.
-    others = {"landing.py", "capture.py", "dataset.py", "orca.py", "vfh.py", "raptor.py"}
+    # test_own_task.py, test_capture.py, test_datasets.py, test_swarm_tasks.py, test_vfh.py.
+    others = {"landing.py", "capture.py", "dataset.py", "orca.py", "vfh.py"}
     others |= {"text_agent.py", "pad_detector.py", "clone.py"}
     assert scripts == {*SHORT, *others}
     page = (EXAMPLES / "README.md").read_text()
