@@ -53,6 +53,7 @@ track of ours by at most 0.1 %.
 """
 SHORTEST: Final = 0.01  # s: of the way to a gate or point
 LONGEST: Final = 20.0
+ASIDE: Final = 0.1  # m/s²: of the first thrusts, since upright is a saddle of some courses
 GUESSES: Final = 8.0, 4.0, 16.0  # m/s²: accelerations with which IPOPT begins, until one leads on
 
 Floats = npt.NDArray[np.float64]
@@ -139,7 +140,7 @@ def least_time(
 def first_guess(
     start: Floats, places: Floats, nodes: int, acceleration: float, gravity: float
 ) -> Floats:
-    """Where IPOPT begins: along straight lines, hovering, in times that follow from the ways."""
+    """Where IPOPT begins: along straight lines, with this acceleration to the middle of each."""
     course = np.vstack((start, places))
     parts = []
     for goal, way in enumerate(np.diff(course, axis=0), 1):
@@ -147,8 +148,9 @@ def first_guess(
         seconds = 2 * np.sqrt(far / acceleration)
         ahead = course[min(goal + 1, len(places))] - course[goal - 1]
         velocity = ahead / (np.linalg.norm(ahead) + 1e-3) * far / seconds
-        hover = np.tile((0.0, 0.0, gravity), nodes)
-        parts += [[seconds], hover, course[goal], velocity]
+        halves = np.where(np.arange(nodes) < nodes / 2, 1.0, -1.0)[:, np.newaxis]
+        thrust = halves * way / far * acceleration + np.array((ASIDE, ASIDE, gravity))
+        parts += [[seconds], thrust.ravel(), course[goal], velocity]
     return np.concatenate(parts)
 
 
