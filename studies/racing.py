@@ -2,7 +2,7 @@
 
     pip install casadi
     OMP_NUM_THREADS=1 python studies/racing.py [--tasks Racing Waypoints Gates] [--seeds 20]
-        [--first-seed 9300] [--flights 1000] [--again] [--out docs/results/racing.json]
+        [--first-seed 9320] [--flights 1000] [--again] [--out docs/results/racing.json]
 
 Each seed is a training by `rotorgram train ppo`, from process start to its end, with the preset
 `tuned`. Its policy, and `geometric`, fly `--flights` starts of the set `final`, on `rigid`: the
@@ -280,7 +280,7 @@ def result_of(kept: Mapping[str, np.ndarray], task: str) -> dict[str, object]:
 
 
 def main() -> None:
-    parser = options(__doc__, tasks=list(WORDS), seeds=20, first_seed=9300, flights=1000,
+    parser = options(__doc__, tasks=list(WORDS), seeds=20, first_seed=9320, flights=1000,
                      again=False, out=RESULTS / "racing.json")  # fmt: skip
     args = parser.parse_args()
     path = args.out.with_name(args.out.stem + "_flights.npz")
