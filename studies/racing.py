@@ -6,7 +6,7 @@
 
 Each seed is a training by `rotorgram train ppo`, from process start to its end, with the preset
 `tuned`. Its policy, and `geometric`, fly `--flights` starts of the set `final`, on `rigid`: the
-same starts for all, of no training. Seeds from 9100 on chose the preset, with starts of the set
+same starts for all, of no training. Seeds 9100 to 9102 chose the preset, with starts of the set
 `tuning`; tests train none.
 
 A lap is the time from the start, at rest, to the end of the control step that passes the last gate
@@ -14,11 +14,11 @@ or point. The bound of each flight is the least time of a point mass through the
 balls in their order, from the same start: see `least_time`. A crash is an end with gates or points
 left before the time is up.
 
-Rows of all flights are kept in the file beside the result, `racing_flights.npz`. A task that is
-flown again takes the place of its rows; seeds go on after those that it has with the same flights.
-`--again` computes the figures from the rows and flies nothing.
+Rows of all flights are kept in the file beside the result, `racing_flights.npz`. Seeds that it has
+with as many flights are not trained again. `--again` computes the figures from the rows and flies
+nothing.
 
-It takes about half an hour of one core.
+It takes about an hour of one core.
 """
 
 import statistics
