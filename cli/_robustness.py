@@ -36,8 +36,8 @@ def measure_robustness(command: "Evaluate", flights: int) -> None:
     jobs = []
     specs = {}
     for pilot in dict.fromkeys((own, *CONTROLLERS)):
-        flown = cells if pilot == own else [_flown_by(pilot, cell) for cell in cells]
         try:
+            flown = cells if pilot == own else [_flown_by(pilot, cell) for cell in cells]
             specs[pilot] = _spec(pilot, flown[0].config)
         except InputError:
             if pilot == own:

@@ -7,6 +7,7 @@ from typing import Any
 
 import pandas as pd
 import pytest
+import robust
 from rotorgram.envs.config import EnvConfig
 from rotorgram.envs.registry import env_spec
 from rotorgram.training.report import judge
@@ -292,6 +293,16 @@ def test_the_table_of_laps_has_what_was_flown() -> None:
         )
         rows.append(f"| `{task}-v0` | {' | '.join(cells)} |")
     check("tasks", *rows)
+
+
+def test_the_page_of_robust_policies_has_what_every_flight_says(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.chdir(RESULTS.parent.parent)
+    found = robust.sums()
+    committed = result("robust")
+    assert {vehicle: committed[vehicle] for vehicle in found} == found
+    check("robustness", *(" ".join(row.split()) for row in robust.page(found).splitlines()))
 
 
 def crashes_of(found: dict[str, Any]) -> str:

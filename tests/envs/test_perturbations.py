@@ -165,7 +165,7 @@ def test_a_training_draws_what_its_vehicle_has_and_says_what_not() -> None:
     _, drawn, refused = together(config.changed(vehicle="crazyflie2"), sizes)
     assert not refused
     assert drawn["mass"] == "uniform(0.8, 1.2)"
-    assert drawn["time_constant"].startswith("uniform(0.69")
+    assert drawn["time_constant"].startswith("loguniform(0.69")
 
 
 def test_the_robust_preset_is_that_of_a_flight_task_and_of_a_row() -> None:

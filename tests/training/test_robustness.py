@@ -3,6 +3,7 @@
 import json
 from pathlib import Path
 
+import numpy as np
 import pandas as pd
 import pytest
 from rotorgram.cli import main
@@ -76,7 +77,8 @@ def test_the_command_writes_table_figure_and_flights(
     content = json.loads((out / "robustness.json").read_text())
     flights = pd.read_csv(out / "flights.csv.gz")
     for cell in content["cells"]:
-        own = flights[(flights["row"] == cell["row"]) & (flights["size"] == cell["size"])]
+        same = [flights[name] == cell[name] for name in ("pilot", "row", "size")]
+        own = flights[np.logical_and.reduce(same)]
         assert (len(own), own["crashed"].sum()) == (cell["flights"], cell["crashes"])
     assert (out / "robustness.png").stat().st_size > 10_000
     assert main([*words, "--out", str(out)]) == 1
