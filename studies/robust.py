@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from measuring import RESULTS, options, write
+from measuring import RESULTS, options, table, write
 from rotorgram.agents import find_preset
 from rotorgram.envs.config import EnvConfig
 from rotorgram.envs.perturbations import perturbed, together
@@ -35,6 +35,7 @@ FILE = RESULTS / "robust.json"
 FLIGHTS = RESULTS / "robust_flights.npz"
 CRASHED = 65535
 PRESETS = ("robust", "tuned")
+PILOTS = (*PRESETS, "geometric")
 
 
 def cells_of(vehicle: str) -> list[Cell]:
@@ -82,7 +83,8 @@ def measure(args: Any) -> None:
     arrays: dict[str, np.ndarray] = {}
     for vehicle in args.vehicles:
         cells = cells_of(vehicle)
-        arrays[f"{vehicle}/cells"] = np.array([cell.label for cell in cells])
+        labels = ["all together" if cell.row == TOGETHER else cell.label for cell in cells]
+        arrays[f"{vehicle}/cells"] = np.array(labels)
         errors = flown("geometric", cells, args.flights, action="position")
         arrays[f"{vehicle}/geometric"] = errors[None]
         for preset in PRESETS:
@@ -108,7 +110,7 @@ def sums() -> dict[str, Any]:
         for vehicle in vehicles:
             labels = arrays[f"{vehicle}/cells"].tolist()
             result[vehicle] = {}
-            for pilot in ("geometric", *PRESETS):
+            for pilot in PILOTS:
                 errors = arrays[f"{vehicle}/{pilot}"]
                 rows = {label: row_of(errors[:, place]) for place, label in enumerate(labels)}
                 result[vehicle][pilot] = {"cells": rows}
@@ -144,13 +146,37 @@ def row_of(errors: np.ndarray) -> dict[str, Any]:
     }
 
 
+def page(result: dict[str, Any]) -> str:
+    """The table of docs/robustness.md: crashes in %, and the median error in cm."""
+    labels = list(
+        dict.fromkeys(label for own in result.values() for label in own["tuned"]["cells"])
+    )
+    head = ["", *(f"{vehicle}: {pilot}" for vehicle in result for pilot in PILOTS)]
+    rows = []
+    for label in labels:
+        cells = [own[pilot]["cells"].get(label) for own in result.values() for pilot in PILOTS]
+        rows.append([label, *map(_shown, cells)])
+    times = [own[pilot].get("seconds") for own in result.values() for pilot in PILOTS]
+    rows.append(["training, s", *(f"{time['median']:.1f}" if time else "–" for time in times)])
+    return table(head, rows)
+
+
+def _shown(cell: dict[str, Any] | None) -> str:
+    if cell is None:
+        return "–"
+    share = 100 * cell["crashes"] / cell["flights"]
+    return f"{share:.2g} %; {100 * cell['median']:.2g}"
+
+
 def main() -> None:
     vehicles = ["crazyflie2", "hummingbird", "paper"]
     args = options(__doc__, vehicles=vehicles, seeds=5, first_seed=700, flights=1000,
                    only_sums=False).parse_args()  # fmt: skip
     if not args.only_sums:
         measure(args)
-    write(FILE, sums())
+    result = sums()
+    write(FILE, result)
+    print(page(result))
 
 
 if __name__ == "__main__":
