@@ -4,7 +4,6 @@ import json
 import shlex
 import sys
 from contextlib import closing, suppress
-from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 from ..agents import CONTROLLERS, find_controller, is_controller
@@ -36,8 +35,10 @@ def measure_robustness(command: "Evaluate", flights: int) -> None:
     jobs = []
     specs = {}
     for pilot in dict.fromkeys((own, *CONTROLLERS)):
+        flown = cells
         try:
-            flown = cells if pilot == own else [_flown_by(pilot, cell) for cell in cells]
+            if pilot != own:
+                flown, _ = robustness.cells_of(_flown_by(pilot, config))
             specs[pilot] = _spec(pilot, flown[0].config)
         except InputError:
             if pilot == own:
@@ -87,10 +88,15 @@ def _quickest(command: "Evaluate") -> EnvConfig:
     return config
 
 
-def _flown_by(controller: str, cell: robustness.Cell) -> robustness.Cell:
-    """The same with what a controller needs."""
+def _flown_by(controller: str, config: EnvConfig) -> EnvConfig:
+    """The env with what a controller needs, and episodes that last as long. Raises `InputError`."""
     options = find_controller(controller).options
-    return replace(cell, config=cell.config.changed(history=1, **options))
+    changed = config.changed(history=1, **options)
+    assert config.episode_length
+    assert config.control_period
+    assert changed.control_period
+    steps = round(config.episode_length * config.control_period / changed.control_period)
+    return changed.changed(episode_length=steps)
 
 
 def _spec(pilot: str, config: EnvConfig) -> EnvSpec:

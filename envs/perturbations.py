@@ -6,6 +6,7 @@ from typing import Any
 
 from ..models.errors import InputError
 from ..models.files import read_own_toml
+from ..sim import PARAMETERS
 from .config import EnvConfig
 from .spec import Values
 
@@ -19,6 +20,7 @@ def perturbed(config: EnvConfig, name: str, size: float) -> tuple[EnvConfig, Val
     Raises `InputError` for an env that cannot have it.
     """
     table = PERTURBATIONS[name]
+    config.load_vehicle().coefficients.need(table.get("needs", ""), name)
     numbers = _numbers(config, table, size)
     changes: Values = {}
     for field in ("effects", "sensors", "events", "task"):
@@ -70,6 +72,11 @@ def for_training(config: EnvConfig, sizes: Mapping[str, float]) -> tuple[EnvConf
     """
     config, drawn, refused = together(config, sizes)
     return config.changed(randomize={**drawn, **config.randomize}), refused
+
+
+def usual_value(name: str) -> float:
+    """Of a parameter that can be drawn, where it is not."""
+    return 1.0 if PARAMETERS[name].unit in ("", "1") else 0.0
 
 
 def check(config: EnvConfig) -> None:

@@ -17,7 +17,7 @@ from pandas import DataFrame
 from ..agents import find_controller, is_controller, load
 from ..envs import registry
 from ..envs.config import EnvConfig
-from ..envs.perturbations import PERTURBATIONS, check, perturbed, together
+from ..envs.perturbations import PERTURBATIONS, check, perturbed, together, usual_value
 from ..envs.vector import LocalVectorEnv
 from ..flights.crowd import fly_crowd
 from ..flights.executors import OnProgress, Tell, WorkersConfig, open_executor, run_jobs
@@ -25,7 +25,6 @@ from ..flights.palette import agent_color, agent_label
 from ..flights.trajectories import evaluation_seed
 from ..models.errors import InputError
 from ..models.fields import immutable
-from ..sim.randomize import PARAMETERS
 from .metrics import Headline
 from .statistics import share_interval
 
@@ -91,10 +90,13 @@ def cells_of(config: EnvConfig) -> tuple[list[Cell], dict[str, str]]:
 
 
 def jobs_of(pilot: str, cells: Sequence[Cell], flights: int) -> list[Job]:
-    """One for each env."""
+    """One for each env; cells that draw nothing have one of their own, or are told from others by
+    what these draw.
+    """
     envs: list[list[Cell]] = []
     for cell in cells:
         same = [own for own in envs if own[0].config == cell.config]
+        same = [own for own in same if cell.drawn or any(one.drawn for one in own)]
         if same:
             same[0].append(cell)
         else:
@@ -157,7 +159,7 @@ def _merged(cells: Sequence[Cell]) -> EnvConfig:
     names = sorted({name for cell in cells for name in cell.drawn})
     drawn = {}
     for name in names:
-        usual = 0.0 if PARAMETERS[name].unit not in ("", "1") else 1.0
+        usual = usual_value(name)
         texts = [str(cell.drawn.get(name, usual)) for cell in cells]
         drawn[name] = " | ".join(texts)
     return replace(config, randomize={**config.randomize, **drawn})
@@ -178,7 +180,9 @@ def table_of(flown: DataFrame, cells: Sequence[Cell]) -> DataFrame:
     lines = []
     for cell in cells:
         for pilot in pilots:
-            own = groups[pilot, cell.row, cell.size]
+            own = groups.get((pilot, cell.row, cell.size))
+            if own is None:  # what this pilot cannot fly
+                continue
             crashes = int(own["crashed"].sum())
             low, high = share_interval(crashes, len(own))
             whole = own.loc[~own["crashed"], "steady"]
@@ -197,10 +201,13 @@ def text_of(table: DataFrame, title: str, headline: Headline) -> str:
     lines.append(" " * width + "".join(f"  {Path(pilot).name[-24:]:>25}" for pilot in pilots))
     for label, own in table.groupby("label", sort=False):
         words = f"{label:{width}}"
-        for line in own.itertuples():
-            share = 100 * line.crashes / line.flights
-            ends = f"({100 * line.low:.1f}-{100 * line.high:.1f})"
-            words += f"  {share:5.1f} {ends:>12} {line.median:6.3g}"
+        for pilot in pilots:
+            text = "–"
+            for line in own[own["pilot"] == pilot].itertuples():
+                share = 100 * line.crashes / line.flights
+                ends = f"({100 * line.low:.1f}-{100 * line.high:.1f})"
+                text = f"{share:5.1f} {ends:>12} {line.median:6.3g}"
+            words += f"  {text:>25}"
         lines.append(words)
     return "\n".join(lines)
 

@@ -298,9 +298,7 @@ def test_others_refuse_a_memory(algorithm: str) -> None:
 
     configs: dict[str, Any] = {"vpg": VPGConfig, "apg": APGConfig}
     config = configs.get(algorithm, PPOConfig)
-    refused = (
-        r"^(memory: expected 0 with .*, got 8; ppo trains one|.* without memory with SB3, .*)$"
-    )
+    refused = r"^(memory: expected 0 with .*, got 8; ppo trains one|.* and reach with SB3, .*)$"
     with pytest.raises(InputError, match=refused):
         make_agent(algorithm, log_of(Scripted(CALM)), config(memory=8), 0)
 

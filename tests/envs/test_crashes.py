@@ -54,8 +54,8 @@ def test_a_crash_costs_what_the_worst_step_would_cost_for_ever(env_id: str) -> N
 
 def test_wide_starts_are_learned(tmp_path: Path) -> None:
     """With a crash that cost 20, PPO learned to crash after 13 steps."""
-    words = ["train", "ppo", "--env", "rotorgram/Hover-v0", "--env-steps", "200000"]
-    wide = ["--env.start-band", "2", "--env.flight-band", "6"]
+    words = ["train", "ppo", "--preset", "tuned", "--env", "rotorgram/Hover-v0"]
+    wide = ["--env.start-band", "2", "--env.flight-band", "6", "--env-steps", "200000"]
     assert main([*words, *wide, "--out", str(tmp_path / "run")]) == 0
     last = pd.read_csv(tmp_path / "run" / "episodes.csv").tail(100)
     assert last["length"].mean() > 240

@@ -51,6 +51,18 @@ def test_cells_of_one_env_fly_together_and_keep_their_own_numbers() -> None:
     pd.testing.assert_frame_equal(again, flown.head(len(again)))
 
 
+def test_cells_that_draw_nothing_fly_apart_from_their_like() -> None:
+    plain = [Cell(row=row, size=1.0, config=CONFIG, drawn={}) for row in (NOMINAL, "wind")]
+    drawn = Cell(row="rotor", size=10, config=CONFIG, drawn={"thrust_1": 0.9})
+    jobs = jobs_of("geometric", [*plain, drawn], 3)
+    assert [[cell.row for cell in job.cells] for job in jobs] == [[NOMINAL, "rotor"], ["wind"]]
+    flown = fly(jobs, WorkersConfig(jobs=1), lambda *_: None)
+    assert flown["row"].value_counts().to_dict() == {NOMINAL: 3, "rotor": 3, "wind": 3}
+    paper, refused = cells_of(CONFIG.changed(vehicle=None))
+    assert "expected sensors.gyro_noise in the vehicle's file, which imu needs" in refused["imu"]
+    assert len(jobs_of("geometric", paper, 3)) < len(paper)
+
+
 def test_a_cell_has_wilson_s_interval_and_the_errors_of_whole_flights() -> None:
     cell = Cell(row=NOMINAL, size=0.0, config=CONFIG, drawn={})
     flown = pd.DataFrame({"crashed": [True] + [False] * 9, "steady": [9.0, *range(1, 10)]})
