@@ -90,6 +90,8 @@ def find_preset(algorithm: str, name: str, env_id: str = DEFAULT_TASK) -> Preset
         )
     tables = presets[name]
     found = next(_lineage(env_id, list(tables)), None)
+    if name == "robust" and not found:  # its draws are those of a task
+        raise InputError(f"preset: expected robust for {' or '.join(tables)}, got {env_id}")
     task = found or DEFAULT_TASK
     settings = dict(tables.get(task, {}))
     flight = {name: settings.pop(name) for name in _FLIGHT if name in settings}

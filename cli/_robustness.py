@@ -12,21 +12,25 @@ from ..envs.perturbations import PERTURBATIONS, check
 from ..envs.spec import EnvSpec
 from ..envs.vector import LocalVectorEnv
 from ..flights.executors import ALL_JOBS, WorkersConfig
-from ..flights.folders import new_folder
-from ..models.errors import InputError, require
+from ..models.errors import InputError, MissingPackage, require
 from ..training import robustness
 from ..training.metrics import Headline
 from ._env import checkpoint_file
 from ._progress import bars
+from ._training import flags_of, folder_to_write
 
 if TYPE_CHECKING:
     from .evaluate import Evaluate
+
+_OF_WIRE = ("listen", "record", "key_file", "insecure", "mavlink")
 
 
 def measure_robustness(command: "Evaluate", flights: int) -> None:
     """Fly the cells of a command's env by its policy, and by the controllers that can beside it;
     print the table, and write it, a figure, and every flight.
     """
+    if unused := sorted(command.given.intersection(_OF_WIRE)):
+        raise InputError(f"robustness: expected flights in this process, got {flags_of(unused)}")
     require("matplotlib", "report", "a figure")
     config = _quickest(command)
     own = command.policy
@@ -40,37 +44,38 @@ def measure_robustness(command: "Evaluate", flights: int) -> None:
             if pilot != own:
                 flown, _ = robustness.cells_of(_flown_by(pilot, config))
             specs[pilot] = _spec(pilot, flown[0].config)
-        except InputError:
+        except (InputError, MissingPackage) as error:
             if pilot == own:
                 raise
+            print(f"not beside: {pilot}: {error}")
             continue
         jobs += robustness.jobs_of(pilot, flown, flights)
-    folder = new_folder(command.out, "robustness")
-    with bars() as progress:
+    with folder_to_write(command.out, "robustness") as folder:
+        with bars() as progress:
 
-        def on_progress(name: str, *now: Any) -> None:
-            if name == ALL_JOBS:  # not each env
-                progress(name, *now)
+            def on_progress(name: str, *now: Any) -> None:
+                if name == ALL_JOBS:  # not each env
+                    progress(name, *now)
 
-        rows = robustness.fly(jobs, WorkersConfig(jobs=command.jobs), on_progress)
-    rows["pilot"] = rows["pilot"].replace(own, command.policy)
-    table = robustness.table_of(rows, cells)
-    headline = Headline.of(specs[own])
-    spec = specs[own]
-    title = f"{command.policy} on {spec.env_id}, {spec.vehicle_text}, {config.backend.name}"
-    print(robustness.text_of(table, title, headline))
-    for name, sentence in refused.items():
-        print(f"not flown: {PERTURBATIONS[name]['label']}: {sentence}")
-    rows.to_csv(folder / "flights.csv.gz", index=False)
-    content = {
-        "command": shlex.join(["rotorgram", *sys.argv[1:]]),
-        "env": config.to_dict(),
-        "not_flown": refused,
-        "cells": json.loads(table.to_json(orient="records")),
-    }
-    (folder / "robustness.json").write_text(json.dumps(content, indent=1) + "\n")
-    robustness.draw(table, title).savefig(folder / "robustness.png")
-    print(f"{folder}: robustness.json, robustness.png, flights.csv.gz")
+            rows = robustness.fly(jobs, WorkersConfig(jobs=command.jobs), on_progress)
+        rows["pilot"] = rows["pilot"].replace(own, command.policy)
+        table = robustness.table_of(rows, cells)
+        headline = Headline.of(specs[own])
+        spec = specs[own]
+        title = f"{command.policy} on {spec.env_id}, {spec.vehicle_text}, {config.backend.name}"
+        print(robustness.text_of(table, title, headline))
+        for name, sentence in refused.items():
+            print(f"not flown: {PERTURBATIONS[name]['label']}: {sentence}")
+        rows.to_csv(folder / "flights.csv.gz", index=False)
+        content = {
+            "command": shlex.join(["rotorgram", *sys.argv[1:]]),
+            "env": config.to_dict(),
+            "not_flown": refused,
+            "cells": json.loads(table.to_json(orient="records")),
+        }
+        (folder / "robustness.json").write_text(json.dumps(content, indent=1) + "\n")
+        robustness.draw(table, title).savefig(folder / "robustness.png")
+        print(f"{folder}: robustness.json, robustness.png, flights.csv.gz")
 
 
 def _quickest(command: "Evaluate") -> EnvConfig:

@@ -1,7 +1,8 @@
 """What a policy is tried with, and trained for, where a world differs: `perturbations.toml`."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
+from dataclasses import replace
 from typing import Any
 
 from ..models.errors import InputError
@@ -74,9 +75,14 @@ def for_training(config: EnvConfig, sizes: Mapping[str, float]) -> tuple[EnvConf
     return config.changed(randomize={**drawn, **config.randomize}), refused
 
 
-def usual_value(name: str) -> float:
-    """Of a parameter that can be drawn, where it is not."""
-    return 1.0 if PARAMETERS[name].unit in ("", "1") else 0.0
+def with_cases(config: EnvConfig, draws: Sequence[Mapping[str, Any]]) -> EnvConfig:
+    """The env of which each episode draws one of several tables of distributions, its case."""
+    names = sorted({name for drawn in draws for name in drawn})
+    cases: Values = {}
+    for name in names:
+        usual = PARAMETERS[name].usual
+        cases[name] = " | ".join(str(drawn.get(name, usual)) for drawn in draws)
+    return replace(config, randomize={**config.randomize, **cases})
 
 
 def check(config: EnvConfig) -> None:

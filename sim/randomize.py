@@ -33,10 +33,15 @@ class Parameter:
     meaning: str
     needs: Sequence[str] = ()
     """At least one of these effects must be on."""
+    usual: float = 0.0
+    """Its value where it is not drawn."""
 
 
 _TABLES = read_own_toml(__file__, "parameters")
-PARAMETERS = {name: Parameter(**table) for name, table in _TABLES.items()}
+PARAMETERS = {
+    name: Parameter(**{"usual": 0.0 if table["unit"] else 1.0, **table})
+    for name, table in _TABLES.items()
+}
 """What can be drawn, by name."""
 CENTER = ("center_x", "center_y", "center_z")
 LEAST_MASS = 0.1  # share of a mass that is left under any load
@@ -127,9 +132,7 @@ class Randomization:
     def _ends(self, name: str) -> tuple[float, float]:
         if name == CASE:
             return 0.0, self._cases - 1.0
-        own = 0.0 if PARAMETERS.get(name, CHANGE).unit else 1.0
-        kinds = self._kinds.get(name, [("uniform", (own, own))])
-        ends = [end for _, pair in kinds for end in pair]
+        ends = [end for _, pair in self._alternatives(name) for end in pair]
         change = self._changing.get(name, 0.0)
         return min(ends) + min(change, 0.0), max(ends) + max(change, 0.0)
 
@@ -141,10 +144,13 @@ class Randomization:
             drawn[CASE] = np.repeat(case[:, :1], case.shape[1], axis=1)  # alike in a world
         for name in self.names:
             if name != CASE:
-                own = 0.0 if PARAMETERS.get(name, CHANGE).unit else 1.0
-                kinds = self._kinds.get(name, [("uniform", (own, own))])
-                drawn[name] = _drawn(name, kinds, draw.uniform(0.0, 1.0), drawn.get(CASE))
+                share = draw.uniform(0.0, 1.0)
+                drawn[name] = _drawn(name, self._alternatives(name), share, drawn.get(CASE))
         return drawn
+
+    def _alternatives(self, name: str) -> list[Distribution]:
+        usual = PARAMETERS.get(name, CHANGE).usual
+        return self._kinds.get(name, [("uniform", (usual, usual))])
 
 
 FIXED = Randomization({}, None)

@@ -118,8 +118,17 @@ def of_ours(
 
 
 def trained(task: str, vehicle: str, folder: Path) -> MakePilot:
-    """PPO, trained with the preset of the task."""
-    words = ("ppo", "--env", f"rotorgram/{task}-v0", "--vehicle", vehicle, "--no-udp")
+    """PPO, trained with the tuned preset of the task."""
+    words = (
+        "ppo",
+        "--preset",
+        "tuned",
+        "--env",
+        f"rotorgram/{task}-v0",
+        "--vehicle",
+        vehicle,
+        "--no-udp",
+    )
     words = (*words, "--effects", "motor_lag", "rotor_drag", "--out", str(folder))
     command = [sys.executable, "-m", "rotorgram.cli", "train", *words]
     subprocess.run(command, check=True, stdout=subprocess.DEVNULL)

@@ -13,7 +13,7 @@ thrust and lag from our vehicle; the square root of a thrust is its motors' spee
 **Cells**: every quadcopter of the library flown by `geometric`, by PPO and by RAPTOR, on the
 backends `rigid` and `mujoco` and in l2f, from the same starts of `Hover-v0`. l2f takes the place of
 the physics alone: task, observation and crashes are ours. PPO is trained on `rigid`, with the
-task's preset, seed 0. Motor lag is on where the vehicle has a time constant.
+task's tuned preset, seed 0. Motor lag is on where the vehicle has a time constant.
 
 **Alone**: RAPTOR in l2f without any code of ours between them: l2f's observation, RAPTOR's motor
 commands. First with the rotors of each craft by their corners, whatever way they turn; then with
@@ -308,8 +308,19 @@ def config_of(vehicle: str, **settings: object) -> EnvConfig:
 
 
 def trained(vehicle: str, folder: Path) -> Any:
-    """The checkpoint of PPO, trained with the preset of the task."""
-    words = ["ppo", "--env", TASK, "--vehicle", vehicle, "--no-udp", "--seed", str(SEED)]
+    """The checkpoint of PPO, trained with the tuned preset of the task."""
+    words = [
+        "ppo",
+        "--preset",
+        "tuned",
+        "--env",
+        TASK,
+        "--vehicle",
+        vehicle,
+        "--no-udp",
+        "--seed",
+        str(SEED),
+    ]
     words += ["--effects", "motor_lag"] if lag_of(vehicle) else []
     command = [sys.executable, "-m", "rotorgram.cli", "train", *words, "--out", str(folder)]
     subprocess.run(command, check=True, stdout=subprocess.DEVNULL)

@@ -4,7 +4,6 @@ perturbation of `envs/perturbations.toml`, at three sizes, alone and all togethe
 
 from collections.abc import Mapping, Sequence
 from contextlib import closing
-from dataclasses import replace
 from math import ceil
 from pathlib import Path
 from typing import Any
@@ -17,7 +16,7 @@ from pandas import DataFrame
 from ..agents import find_controller, is_controller, load
 from ..envs import registry
 from ..envs.config import EnvConfig
-from ..envs.perturbations import PERTURBATIONS, check, perturbed, together, usual_value
+from ..envs.perturbations import PERTURBATIONS, check, perturbed, together, with_cases
 from ..envs.vector import LocalVectorEnv
 from ..flights.crowd import fly_crowd
 from ..flights.executors import OnProgress, Tell, WorkersConfig, open_executor, run_jobs
@@ -64,6 +63,8 @@ class Job:
     cells: tuple[Cell, ...]
     flights: int
     """Of each cell."""
+    own_task: str | None
+    """As of an `EnvConfig`: a worker has to import it."""
 
 
 def cells_of(config: EnvConfig) -> tuple[list[Cell], dict[str, str]]:
@@ -101,7 +102,10 @@ def jobs_of(pilot: str, cells: Sequence[Cell], flights: int) -> list[Job]:
             same[0].append(cell)
         else:
             envs.append([cell])
-    return [Job(pilot=pilot, cells=tuple(own), flights=flights) for own in envs]
+    return [
+        Job(pilot=pilot, cells=tuple(own), flights=flights, own_task=own[0].config.own_task)
+        for own in envs
+    ]
 
 
 def fly(jobs: Sequence[Job], workers: WorkersConfig, on_progress: OnProgress) -> DataFrame:
@@ -117,9 +121,9 @@ def fly(jobs: Sequence[Job], workers: WorkersConfig, on_progress: OnProgress) ->
 
 def _fly(job: Job, tell: Tell) -> DataFrame:
     """In a worker: episodes until each cell has its flights, the same number of each."""
-    config = _merged(job.cells)
-    if config.own_task:
-        registry.load(config.own_task)
+    if job.own_task:
+        registry.load(job.own_task)
+    config = with_cases(job.cells[0].config, [cell.drawn for cell in job.cells])
     cells = len(job.cells)
     share = PERTURBATIONS.get(job.cells[0].row, {}).get("sample", 1.0)
     flights = ceil(share * job.flights)
@@ -140,8 +144,9 @@ def _fly(job: Job, tell: Tell) -> DataFrame:
     kept = flown.groupby("case").head(wanted)
     rows = [job.cells[case].row for case in kept["case"]]
     sizes = [job.cells[case].size for case in kept["case"]]
-    names = {"pilot": job.pilot, "row": rows, "size": sizes, "crashed": _crashed(kept, headline)}
-    return kept.drop(columns="case").assign(**names)
+    crashed = _crashed(kept, headline)
+    told = {"pilot": job.pilot, "row": rows, "size": sizes, "crashed": crashed}
+    return kept.drop(columns="case").assign(**told)
 
 
 def policy_of(pilot: str, env: LocalVectorEnv) -> Any:
@@ -151,18 +156,6 @@ def policy_of(pilot: str, env: LocalVectorEnv) -> Any:
     if is_controller(pilot):
         return find_controller(pilot)(env.env_spec)
     return load(Path(pilot)).policy(env.env_spec)
-
-
-def _merged(cells: Sequence[Cell]) -> EnvConfig:
-    """The env of cells, which draws one of them for each episode."""
-    config = cells[0].config
-    names = sorted({name for cell in cells for name in cell.drawn})
-    drawn = {}
-    for name in names:
-        usual = usual_value(name)
-        texts = [str(cell.drawn.get(name, usual)) for cell in cells]
-        drawn[name] = " | ".join(texts)
-    return replace(config, randomize={**config.randomize, **drawn})
 
 
 def _crashed(flown: DataFrame, headline: Headline) -> "pd.Series[bool]":

@@ -181,6 +181,29 @@ def test_bytes_of_pictures_come_in_as_0_to_1() -> None:
     np.testing.assert_allclose(by_inputs, [[2.0], [5 / 255], [0.0], [2 / 255]], rtol=1e-6)
 
 
+def scales_as_torch(
+    network: Network,
+    weights: Weights,
+    inputs: np.ndarray,
+    tensor: torch.Tensor,
+    scaled: torch.Tensor,
+) -> None:
+    """The outputs and all gradients are torch's, of an MLP that sees the scaled tensor."""
+    arrays = tensors(weights)
+    outputs = torch_mlp(arrays, scaled, "tanh")
+    got = network.forward(inputs)
+    np.testing.assert_allclose(got, outputs.detach().numpy().T, rtol=1e-5, atol=1e-6)
+    slope = normal(2, BATCH)
+    outputs.backward(torch.tensor(slope.T))
+    network.learn(slope.copy())
+    agree(weights, arrays)
+    network.forward(inputs)
+    back = network.back(slope.copy())
+    theirs = tensor.grad
+    assert theirs is not None
+    np.testing.assert_allclose(back, theirs.numpy().T, rtol=1e-4, atol=1e-5)
+
+
 def test_distances_come_in_as_nearness() -> None:
     shapes = ((1, 2), (1, 1, 1))  # of rays, and of a picture
     near = [ArraySpec(name=f"near {s}", shape=s, low=0.0, unit="m") for s in shapes]
@@ -193,19 +216,7 @@ def test_distances_come_in_as_nearness() -> None:
     tensor = torch.tensor(inputs.T, requires_grad=True)
     nearness = 2 / (1 + tensor / 2) - 0.5
     is_near = torch.tensor([False, True, True, False, False, True])
-    arrays = tensors(weights)
-    outputs = torch_mlp(arrays, torch.where(is_near, nearness, tensor), "tanh")
-    got = network.forward(inputs)
-    np.testing.assert_allclose(got, outputs.detach().numpy().T, rtol=1e-5, atol=1e-6)
-    slope = normal(2, BATCH)
-    outputs.backward(torch.tensor(slope.T))
-    network.learn(slope.copy())
-    agree(weights, arrays)
-    network.forward(inputs)
-    back = network.back(slope.copy())
-    theirs = tensor.grad
-    assert theirs is not None
-    np.testing.assert_allclose(back, theirs.numpy().T, rtol=1e-4, atol=1e-5)
+    scales_as_torch(network, weights, inputs, tensor, torch.where(is_near, nearness, tensor))
 
 
 def test_lengths_come_in_softened() -> None:
@@ -220,15 +231,4 @@ def test_lengths_come_in_softened() -> None:
     tensor = torch.tensor(inputs.T, requires_grad=True)
     is_length = torch.tensor([True, False, True, False, True, True])
     softened = tensor / (1 + tensor.abs() / 2)
-    arrays = tensors(weights)
-    outputs = torch_mlp(arrays, torch.where(is_length, softened, tensor), "tanh")
-    got = network.forward(inputs)
-    np.testing.assert_allclose(got, outputs.detach().numpy().T, rtol=1e-5, atol=1e-6)
-    slope = normal(2, BATCH)
-    outputs.backward(torch.tensor(slope.T))
-    network.learn(slope.copy())
-    agree(weights, arrays)
-    network.forward(inputs)
-    assert tensor.grad is not None
-    theirs = tensor.grad.numpy().T
-    np.testing.assert_allclose(network.back(slope.copy()), theirs, rtol=1e-4, atol=1e-5)
+    scales_as_torch(network, weights, inputs, tensor, torch.where(is_length, softened, tensor))

@@ -1,6 +1,7 @@
 """The table of robustness: its cells, its flights, its numbers, and the command that writes it."""
 
 import json
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -85,6 +86,7 @@ def test_the_command_writes_table_figure_and_flights(
     assert main([*words, "--out", str(out)]) == 0
     text = capsys.readouterr().out
     assert "one rotor weaker 30 %" in text
+    assert "not beside: pid: pid: expected the env rotorgram/Elevation-v0" in text
     assert "not flown: thrust by the curve: vehicle: expected rotors.curve" in text
     content = json.loads((out / "robustness.json").read_text())
     flights = pd.read_csv(out / "flights.csv.gz")
@@ -95,5 +97,33 @@ def test_the_command_writes_table_figure_and_flights(
     assert (out / "robustness.png").stat().st_size > 10_000
     assert main([*words, "--out", str(out)]) == 1
     assert "out: expected a new folder" in capsys.readouterr().err
+    assert main([*words, "--record", "a.mcap"]) == 1
+    assert "robustness: expected flights in this process, got --record" in capsys.readouterr().err
     assert main(["evaluate", "pid", "--out", str(out)]) == 1
     assert "out, jobs: expected them with --robustness" in capsys.readouterr().err
+
+
+def test_a_task_of_one_s_own_flies_in_workers(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Where a package of a controller is missing, the others fly."""
+    (tmp_path / "mine.py").write_text(
+        "from rotorgram.envs import register\n"
+        "from rotorgram.envs.tasks.hover import Hover\n\n\n"
+        "class Mine(Hover):\n"
+        "    episode_length = 40\n\n\n"
+        'register("my/Mine-v0", Mine)\n'
+    )
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    monkeypatch.setitem(sys.modules, "foundation_policy", None)
+    few = {name: PERTURBATIONS[name] for name in ("rotor", "lag")}
+    monkeypatch.setattr(robustness, "PERTURBATIONS", few)
+    words = ["evaluate", "geometric", "--env", "mine:my/Mine-v0", "--vehicle", "hummingbird"]
+    words += ["--robustness", "--episodes", "4", "--jobs", "2", "--out", "table"]
+    assert main(words) == 0
+    text = capsys.readouterr().out
+    assert "pip install 'rotorgram[raptor]'" in text
+    flights = pd.read_csv(tmp_path / "table" / "flights.csv.gz")
+    assert len(flights) == 4 * (1 + 3 + 3 + 3)
+    assert set(flights["pilot"]) == {"geometric"}
