@@ -331,7 +331,11 @@ def test_huge_weights_of_a_training_that_diverges_are_no_error_of_the_env(algori
 
 @pytest.mark.parametrize(
     ("algorithm", "name"),
-    [(algorithm, name) for algorithm in SMALL for name in presets_of(algorithm)],
+    [
+        (algorithm, name)
+        for algorithm in SMALL
+        for name in sorted(presets_of(algorithm).keys() - {"robust"})
+    ],
 )
 @pytest.mark.parametrize("action_type", ["continuous", "discrete"])
 def test_every_agent_trains_with_every_preset_and_kind_of_action(

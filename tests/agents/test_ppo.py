@@ -11,6 +11,7 @@ from drones import log_of, rollout
 from nets import arrays_of
 from rotorgram.agents import PPOConfig, find_preset, load
 from rotorgram.agents.ppo import PPO
+from rotorgram.cli import main
 from rotorgram.models.errors import InputError
 
 SMALL = PPOConfig(gamma=0.5, gae_lambda=0.5, steps_per_update=3, epochs=1, minibatches=1)
@@ -80,6 +81,18 @@ def test_the_tuned_preset_depends_on_the_task() -> None:
         assert crossing == replace(swarm, env_id="rotorgram/Crossing-v0")
     with pytest.raises(InputError, match="preset: expected robust or tuned for ppo, got 'paper'"):
         find_preset("ppo", "paper")
+
+
+def test_training_of_hover_is_robust_if_nothing_else_is_asked(tmp_path: Path) -> None:
+    folder = tmp_path / "run"
+    words = ["train", "ppo", "--env", "rotorgram/Hover-v0", "--env-steps", "8192"]
+    assert main([*words, "--out", str(folder)]) == 0
+    kept = load(folder / "checkpoint.safetensors")
+    robust = find_preset("ppo", "robust", "rotorgram/Hover-v0")
+    assert kept.num_envs == robust.num_envs
+    assert kept.config["reach"] == robust.config.reach
+    assert {"start_y", "start_tilt", "mass"} <= {*kept.spec.options["randomize"]}
+    assert all(np.isfinite(array).all() for array in kept.policy().weights.arrays.values())
 
 
 def test_training_by_the_command_takes_the_preset_s_drones_and_loads_nothing_slow(
