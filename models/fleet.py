@@ -1,18 +1,19 @@
-"""Vehicles of the drones of one world, where they are not all alike."""
+"""Vehicles that are not one for all: of the drones of one world, and of its episodes."""
 
 import copy
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
-from functools import partial
+from functools import lru_cache, partial
 from hashlib import blake2b
 from pathlib import Path
 from typing import Any, Self
 
 import numpy as np
 
+from .drawn import columns, drawn_craft, middle_file, range_of, table_of
 from .errors import InputError
-from .library import words_of
+from .library import is_drawn, words_of
 from .vehicle import Vehicle
 
 _OF_DRONES = (
@@ -70,6 +71,39 @@ class Fleet(Vehicle):
         return partial(load_vehicles, linear_drag=self.linear_drag), (paths, len(self.members))
 
 
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Pool(Vehicle):
+    """Craft of which each episode draws one, in the place of a vehicle for all.
+
+    Without air a craft flies as one of another mass does whose thrusts and inertia are as many
+    times as large: here each has 1 kg, and a thrust is that per kilogram. The model, the radius
+    and the height at rest are those of a craft of 1 kg in the middle of all ranges.
+    """
+
+    numbers: range
+    """Of the craft."""
+    table: np.ndarray
+    """A row for each, as of `drawn.columns`, (N, k)."""
+
+    def __reduce__(self) -> tuple[object, ...]:
+        """Drawn again."""
+        return load_pool, (self.name, self.linear_drag)
+
+
+@lru_cache(maxsize=8)
+def load_pool(word: str, linear_drag: float = 0.0) -> Pool:
+    """The pool of a word. Raises `InputError`."""
+    numbers = range_of(word)
+    base = Vehicle.load(middle_file(), linear_drag=linear_drag)
+    table = table_of(drawn_craft(numbers))
+    digest = blake2b(table.tobytes() + base.hash.encode(), digest_size=16)
+    values: dict[str, Any] = {one.name: getattr(base, one.name) for one in fields(Vehicle)}
+    shares = columns(table)
+    values["thrust_high"] = (shares["highest"] * shares["share"]).max(axis=0)
+    values |= {"name": f"drawn:{numbers[0]}-{numbers[-1]}", "hash": digest.hexdigest()}
+    return Pool(**values, numbers=numbers, table=table)
+
+
 def load_vehicles(
     vehicle: Path | str | Sequence[str] | None,
     drones: int,
@@ -90,13 +124,22 @@ def load_vehicles(
             f"vehicle: expected at most one vehicle for each of {drones} drones, "
             f"got {len(names)}: {got}"
         )
-    loaded = [Vehicle.load(name, linear_drag=linear_drag) for name in names]
+    loaded = [_loaded(name, linear_drag) for name in names]
     step = min(longest_step, *(one.timestep for one in loaded))
     kinds = {one: _under(one, step, loaded[0].gravity) for one in loaded}
     members = [kinds[one] for one in loaded]
     if len(kinds) == 1:
         return members[0]
+    if any(isinstance(one, Pool) for one in members):
+        raise InputError(f"vehicle: expected no others besides drawn craft, got {names}")
     return Fleet.of([members[i % len(members)] for i in range(drones)])
+
+
+def _loaded(name: str | None, linear_drag: float) -> Vehicle:
+    """One vehicle, or a `Pool` of drawn craft."""
+    if name and is_drawn(name) and len(range_of(name)) > 1:
+        return load_pool(name, linear_drag)
+    return Vehicle.load(name, linear_drag=linear_drag)
 
 
 def members_of(vehicle: Vehicle, drones: int) -> tuple[Vehicle, ...]:

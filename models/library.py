@@ -37,9 +37,14 @@ def words_of(option: str, given: object) -> tuple[str, ...]:
     return tuple(words)
 
 
+def is_drawn(word: str) -> bool:
+    """Whether a word stands for a drawn craft, as `drawn:7`, or for a pool of them."""
+    return word == "drawn" or word.startswith("drawn:")
+
+
 def is_of_the_library(vehicle: str) -> bool:
-    """Whether a word is the bare name of a vehicle of the library, and no file has that name."""
-    return vehicle in vehicle_names() and not os.path.isfile(vehicle)
+    """Whether a word stands for a vehicle that comes with the package, and for no file."""
+    return (vehicle in vehicle_names() or is_drawn(vehicle)) and not os.path.isfile(vehicle)
 
 
 def find_vehicle(vehicle: Path | str | None) -> Path:
@@ -47,6 +52,10 @@ def find_vehicle(vehicle: Path | str | None) -> Path:
     if vehicle is None:
         return QUAD_XML.resolve()
     word = str(vehicle)
+    if is_drawn(word):
+        from .drawn import drawn_file  # it imports MuJoCo
+
+        return drawn_file(word)
     if is_of_the_library(word):
         return (LIBRARY / word / "vehicle.toml").resolve()
     path = Path(word)
@@ -54,7 +63,9 @@ def find_vehicle(vehicle: Path | str | None) -> Path:
     is_no_file = path.suffix == "" or "\0" in word or os.path.lexists(word)
     if not isinstance(vehicle, str | Path) or (is_no_file and not os.path.isfile(word)):
         known = ", ".join(vehicle_names())
-        raise InputError(f"vehicle: expected a file, or one of {known}, got {word!r:.300}")
+        raise InputError(
+            f"vehicle: expected a file, drawn:NUMBER, or one of {known}, got {word!r:.300}"
+        )
     if path.suffix.lower() == ".urdf":
         raise InputError(
             "vehicle: expected a TOML file that names the rotors, with [model] and "

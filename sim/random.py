@@ -28,6 +28,7 @@ Mask = Array
 START = crc32(b"start")
 """The draws with which a task begins episodes."""
 RANDOMIZATION = crc32(b"randomization")
+CRAFT = crc32(b"craft")
 RADIO = crc32(b"radio")
 SCENES = crc32(b"scenes")
 GUSTS = "gusts"

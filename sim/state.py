@@ -43,6 +43,9 @@ class WorldState:
     backend `rigid` two drones touch where their spheres overlap."""
     colliding: Array = None
     """Whether it was in contact with another drone; None in worlds of one drone."""
+    craft: Array = None
+    """Numbers of the craft that each drone is, (W, A, k), as of `models.drawn.columns`; None where
+    the vehicle is one for all."""
     payload: Array = None
     """Position of each drone's payload, world frame, m, shape (W, A, 3), which all drones of a
     world share; None without payloads."""

@@ -10,16 +10,17 @@ import numpy as np
 
 from .. import models
 from ..models import Backend
+from ..models.drawn import columns
 from ..models.errors import InputError, NotCopied
 from ..models.fields import immutable
 from ..scenes import SceneConfig
 from ..scenes.config import refuse_hidden
 from .compile.llvm import trouble
 from .effects import NO_EFFECTS, EffectOptions, Effects
-from .random import RANDOMIZATION, START, Draw, Random
+from .random import CRAFT, RANDOMIZATION, START, Draw, Random
 from .randomize import CHANGE, FIXED, PARAMETERS, Randomization, moved
 from .snapshots import Arrays, Kept, Snapshot, joined, part_of
-from .state import FAR, Array, ByName, InitialState, WorldState, chosen, clip
+from .state import FAR, Array, ByName, InitialState, WorldState, chosen, clip, looked_up
 
 if TYPE_CHECKING:
     from ..scenes.solids import Solids
@@ -178,6 +179,7 @@ class World(Kept, NotCopied):
         rows = mask[..., None]
         self.random.begin(mask)
         self.scenery.begin(self.random, mask)
+        self._draw_craft(mask)
         self._draw_parameters(mask)
         begun = self._begun(mask, pose)
         self._move(begun, mask)
@@ -221,7 +223,7 @@ class World(Kept, NotCopied):
 
     def _fly_with(self, parameters: ByName) -> None:
         self.parameters = parameters
-        self.effects.take(parameters)
+        self.effects.take(parameters, self.state.craft)
         self._vary(parameters)
 
     def acceleration(self) -> Array:
@@ -259,11 +261,11 @@ class World(Kept, NotCopied):
         """Put a snapshot back; no step runs. No later bit differs from those that followed it."""
         arrays = {name: array.copy() for name, array in arrays.items()}
         super().restore(arrays)
-        self.drawn = part_of(arrays, "parameters")
-        self._fly_with({**self.drawn})
         state = part_of(arrays, "state")
         for name in self.of_state:
             setattr(self.state, name, state.get(name))
+        self.drawn = part_of(arrays, "parameters")
+        self._fly_with({**self.drawn})
         self._put(state)
 
     def parts(self) -> Mapping[str, Kept]:
@@ -310,6 +312,14 @@ class World(Kept, NotCopied):
         """Follow the state and the attributes that were put back, and put back what is hidden."""
         raise NotImplementedError
 
+    def _draw_craft(self, mask: Array) -> None:
+        """Draw the craft of the worlds of a mask from the vehicle's pool, if it is one."""
+        table = getattr(self.vehicle, "table", None)
+        if table is not None:
+            share = Draw(self.random, CRAFT, mask).uniform(0.0, len(table))
+            rows = looked_up(table, np.floor(share))
+            self.state.craft = chosen(mask, self._typed(rows), self.state.craft)
+
     def _draw_parameters(self, mask: Array) -> None:
         """Draw the parameters of the worlds of a mask."""
         if self._drawn:
@@ -327,6 +337,8 @@ class World(Kept, NotCopied):
             "body_rates": 0.0,
             "thrust": self.vehicle.hover_thrust,
         }
+        if self.state.craft is not None:
+            usual["thrust"] = columns(self.state.craft)["share"] * self.vehicle.gravity
         begun = {}
         for name, default in usual.items():
             given = getattr(pose, name)
@@ -350,6 +362,11 @@ def check_world(
     """
     if backend != "mujoco":
         refuse_hidden(hidden, f"the backend {backend}")
+    if backend == "mujoco" and hasattr(vehicle, "table"):
+        raise InputError(
+            "vehicle: expected one with the backend mujoco, as drawn:7, got a pool of craft, "
+            f"{vehicle.name}"
+        )
     if getattr(vehicle, "members", ()):
         if backend != "mujoco":
             raise InputError(

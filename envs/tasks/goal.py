@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from typing import Annotated, NamedTuple
+from typing import Annotated, Literal, NamedTuple
 
 import numpy as np
 
@@ -56,6 +56,9 @@ class Number(NamedTuple):
 # Metrics of several tasks.
 POSITION_ERROR = Metric(name="position_error", unit="m", settled=0.1, held=0.1, symbol="e")
 FLIGHT_TIME = Metric(name="flight_time", unit="s", final=True)
+
+Frame = Literal["body", "world"]
+"""Of an option: the frame of an observation."""
 
 NumberOrRange = float | tuple[float, float]
 """Of an option: a number, or (low, high) to draw one for each episode."""
@@ -121,16 +124,21 @@ class GoalTask(NumbersTask):
 
     Goal minus position, m; velocity, m/s; the directions of body x, the nose, and of body z, the
     thrust: all in the world, turned by the wanted heading. Then the body rates, rad/s, and the
-    thrust of each rotor over its hover thrust, minus 1. `docs/observations.md` lists the numbers of
-    every task by index.
+    thrust of each rotor over its hover thrust, minus 1; with the action `wrench` the four numbers
+    of the action that the rotors were commanded to give take their place. `docs/observations.md`
+    lists the numbers of every task by index.
 
     Numbers are clipped: positions at twice the flight band, speeds at 100 m/s, rates at 100 rad/s.
     A derived class calls `define_observation` in `setup`, and gives further numbers in `further`.
     It has an option `goal`, or overrides the method.
 
     With `body` the first two vectors are in the body frame, and the direction of world z in the
-    body frame takes the place of nose and thrust axis: 12 + R numbers that no heading changes.
+    body frame takes the place of nose and thrust axis: 12 + R numbers that no heading changes. In
+    a task that `heads` somewhere three more follow it, the wanted direction of the nose.
     """
+
+    heads = False
+    """Whether the observation in the body frame has the wanted direction of the nose."""
 
     wanted = 0.0
     """Heading that the frame of the observation is turned by, rad, anticlockwise from x."""
@@ -139,20 +147,36 @@ class GoalTask(NumbersTask):
 
     def define_observation(self, band: float, further: Sequence[Number] = ()) -> None:
         """Set `observation`: positions up to twice the band, m, and further numbers after them."""
-        vehicle = self.vehicle
         numbers = along("goal - position", "m", 2 * band) + along("velocity", "m/s", MAX_SPEED)
-        for name in ("up",) if self.body else ("nose", "thrust axis"):
+        for name in self._directions():
             numbers += along(name, "1", 1.001)
         numbers += along("body rate", "rad/s", MAX_RATE)
+        numbers += self._thrusts()
+        numbers += further
+        frame = "body" if self.body else "world turned by the wanted heading; body rates: body"
+        self.define_numbers(numbers, frame)
+
+    def _directions(self) -> Sequence[str]:
+        """Which directions are seen."""
+        if not self.body:
+            return "nose", "thrust axis"
+        return ("up", "wanted nose") if self.heads else ("up",)
+
+    def _thrusts(self) -> list[Number]:
+        """What is seen of the rotors."""
+        if hasattr(self.controller, "applied"):
+            return [
+                Number(f"applied {name}", "1", -3.0, 3.0) for name in self.controller.components
+            ]
+        vehicle = self.vehicle
         # Of any vehicle, where there are several.
         weakest = np.atleast_2d(vehicle.thrust_low / vehicle.hover_thrust - 1).min(axis=0)
         strongest = np.atleast_2d(vehicle.thrust_high / vehicle.hover_thrust - 1).max(axis=0)
         limits = zip((weakest - 0.001).tolist(), (strongest + 0.001).tolist(), strict=True)
-        for rotor, (low, high) in enumerate(limits, 1):
-            numbers.append(Number(f"thrust {rotor} over hover", "1", low, high))
-        numbers += further
-        frame = "body" if self.body else "world turned by the wanted heading; body rates: body"
-        self.define_numbers(numbers, frame)
+        return [
+            Number(f"thrust {rotor} over hover", "1", low, high)
+            for rotor, (low, high) in enumerate(limits, 1)
+        ]
 
     def observe(self, state: State) -> dict[str, Array]:
         """See the table of the class; further numbers are those of `further`."""
@@ -162,12 +186,18 @@ class GoalTask(NumbersTask):
         if self.body:
             vectors = [to_body(quaternion, v) for v in (to_place, state.velocity)]
             vectors.append(world_z(quaternion))
+            if self.heads:
+                ahead = at((cos(self.wanted), sin(self.wanted), 0.0), position[..., 0])
+                vectors.append(to_body(quaternion, ahead))
         else:
             seen = (to_place, state.velocity, body_x(quaternion), body_z(quaternion))
             vectors = [self.turned(vector) for vector in seen]
         dtype = state.thrust.dtype
-        hover = np.asarray(self.vehicle.hover_thrust, dtype)
-        thrust = state.thrust / hover - 1.0
+        applied = getattr(self.controller, "applied", None)
+        if applied:
+            thrust = stack(applied(state)).astype(dtype)
+        else:
+            thrust = state.thrust / np.asarray(self.vehicle.hover_thrust, dtype) - 1.0
         parts = [*vectors, state.body_rates, thrust, *self.further(state)]
         bounds = [bound.astype(dtype) for bound in self._bounds]
         return {"observation": clip(np.concat(parts, axis=-1), *bounds)}

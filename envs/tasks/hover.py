@@ -18,6 +18,7 @@ from .goal import (
     POSITION_ERROR,
     WORST_RATES,
     Distance,
+    Frame,
     GoalTask,
     Heading,
     Point,
@@ -51,6 +52,8 @@ class HoverOptions(TaskOptions):
     """Largest error of the heading at the start, degrees."""
     flight_band: Distance = 3.0
     """An episode terminates when the craft is further than this from its goal, m."""
+    frame: Frame = "world"
+    """Frame of the observation, see `GoalTask`."""
 
     def check(self) -> None:
         """Check the options of this task. Raises `InputError`."""
@@ -87,6 +90,7 @@ class Hover(GoalTask):
     """
 
     Options = HoverOptions
+    heads = True
     near = ERROR_SCALE
     """Distance at which the reward for nearness crosses zero, m."""
     worst_step = -1.0 - HEADING_WEIGHT + WORST_RATES
@@ -100,6 +104,7 @@ class Hover(GoalTask):
         options = self.options
         check_height("goal", options.goal[2], self.vehicle.rest_height + options.start_band)
         self.wanted = math.radians(options.heading)
+        self.body = options.frame == "body"
         self.define_observation(options.flight_band)
 
     def begin(self, draw: Draw) -> InitialState:

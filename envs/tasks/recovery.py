@@ -1,7 +1,7 @@
 """`rotorgram/Recovery-v0`: thrown at any attitude and spinning, come to rest where it began."""
 
 import math
-from typing import Annotated, Literal
+from typing import Annotated
 
 import numpy as np
 
@@ -11,6 +11,7 @@ from ..spec import Metric
 from ..state import State
 from .goal import (
     WORST_RATES,
+    Frame,
     GoalTask,
     Point,
     Size,
@@ -27,7 +28,6 @@ from .task import Outcome, TaskOptions
 ERROR_SCALE = 1.0  # Distance at which the reward for nearness crosses zero, m
 TILT_WEIGHT = 0.25  # Cost of a tilt of 90°; upside down it is twice as much
 STOP_TIME = 0.5  # Longest time to stop the spin about an axis by all torque about it, s
-Frame = Literal["body", "world"]
 
 
 @immutable

@@ -15,11 +15,12 @@ from typing import NamedTuple
 import numpy as np
 
 from ...models import matrices
+from ...models.drawn import columns
 from ...models.vehicle import Vehicle
 from .. import elementary
 from ..randomize import CENTER, LEAST_MASS
 from ..rotations import product, transposed
-from ..state import Array
+from ..state import Array, parts_of
 
 Vector = tuple[Array, Array, Array]
 Push = tuple[Vector, Vector, Vector]
@@ -70,6 +71,8 @@ class Varying(NamedTuple):
     """Inverse of the inertia without that factor, three rows."""
     gyroscopic: Array
     """Factors of `_euler`."""
+    torques: Array
+    """Of one newton of each rotor about the center of mass, N·m, three rows of R."""
     reaction: Array
     """Factor of the rotors' torque about their axes, or None."""
     shift: Vector
@@ -113,11 +116,16 @@ class RigidBody:
         self._of_inertia = _euler(vehicle.inertia)
         self.vary({})
 
-    def vary(self, parameters: Mapping[str, Array], inertia: np.ndarray | None = None) -> None:
+    def vary(
+        self,
+        parameters: Mapping[str, Array],
+        inertia: np.ndarray | None = None,
+        craft: Array = None,
+    ) -> None:
         """Take drawn parameters by their names, vectors.
 
         An inertia about the center of mass for each body, kg·m², (..., 3, 3), may replace the
-        vehicle's.
+        vehicle's; so may the numbers of drawn craft, as of `WorldState.craft`.
         """
         mass, center = self._least
         factor = parameters.get("mass", 1.0)
@@ -126,12 +134,18 @@ class RigidBody:
         if "load" in parameters:
             whole = np.maximum(whole + parameters["load"], LEAST_MASS * whole)
         shift: Vector = tuple(parameters.get(name, 0.0) for name in CENTER)
+        torques = self._torques
+        reaction = parameters.get("reaction")
+        if craft is not None:
+            turn, gyroscopic, torques, center = _of_craft(craft, reaction)
+            reaction = None
         self.varying = Varying(
             mass=whole,
             easier=1.0 / factor / parameters.get("inertia", 1.0),
             turn=turn,
             gyroscopic=gyroscopic,
-            reaction=parameters.get("reaction"),
+            torques=torques,
+            reaction=reaction,
             shift=shift,
             center=tuple(a + b for a, b in zip(shift, center, strict=True)),
         )
@@ -153,7 +167,7 @@ class RigidBody:
         varying = self.varying
         force = forth(self._axes, rotors)
         if varying.reaction is None:
-            torque = forth(self._torques, rotors)
+            torque = forth(varying.torques, rotors)
         else:
             both = zip(forth(self._levers, rotors), forth(self._reactions, rotors), strict=True)
             torque = tuple(added(a, (b, varying.reaction)) for a, b in both)
@@ -239,6 +253,24 @@ def _euler(inertia: np.ndarray) -> tuple[Array, Array]:
     folded = np.triu(terms) + np.triu(terms.swapaxes(-1, -2), 1)
     size = abs(terms).max()
     return _sparse(turn), [_sparse(folded[..., axis, :, :], size) for axis in range(3)]
+
+
+def _of_craft(craft: Array, reaction: Array) -> tuple[Array, Array, Array, Vector]:
+    """Of drawn craft: `turn`, `gyroscopic`, `torques` with a factor of the reactions or None, and
+    the center of mass, as of `Varying`.
+    """
+    numbers = {name: parts_of(part) for name, part in columns(craft).items()}
+    x, y, z = numbers["inertia"]
+    turn = [[1.0 / x, 0.0, 0.0], [0.0, 1.0 / y, 0.0], [0.0, 0.0, 1.0 / z]]
+    gyroscopic = [[[0.0] * 3 for _ in range(3)] for _ in range(3)]
+    gyroscopic[0][1][2] = (y - z) / x
+    gyroscopic[1][0][2] = (z - x) / y
+    gyroscopic[2][0][1] = (x - y) / z
+    yaw = numbers["yaw"]
+    if reaction is not None:
+        yaw = [one * reaction for one in yaw]
+    torques = [numbers["y"], [-one for one in numbers["x"]], yaw]
+    return turn, gyroscopic, torques, (0.0, 0.0, *numbers["center"])
 
 
 def _sparse(matrix: np.ndarray, size: float | None = None) -> list[list[Array]]:

@@ -55,7 +55,7 @@ class RigidWorld(World):
             nothing does.
     """
 
-    of_state = ("command", "thrust", "touching", "colliding")
+    of_state = ("command", "thrust", "touching", "colliding", "craft")
     arrays = (*World.arrays, "bad", "motion", "slack")
 
     def __init__(
@@ -157,8 +157,9 @@ class RigidWorld(World):
     def _vary(self, parameters: Mapping[str, Array], inertia: Array = None) -> None:
         """As `RigidBody.vary`, with numbers of this dtype."""
         body = self._body
-        if parameters:
-            body.vary(parameters, inertia)
+        craft = self.state.craft
+        if parameters or craft is not None:
+            body.vary(parameters, inertia, craft)
             body.varying = mapped(body.varying, self._typed)
 
     def _advanced(

@@ -402,8 +402,8 @@ class _Printer:
 
     def _constant(self, table: np.ndarray) -> str:
         """The name of a table in the module, where equal ones are there once."""
-        content = "".join(f"\\{byte:02x}" for byte in table.tobytes())
-        kept = f'constant [{table.nbytes} x i8] c"{content}", align 64'
+        content = table.tobytes().hex("\\")
+        kept = f'constant [{table.nbytes} x i8] c"\\{content}", align 64'
         return self._constants.setdefault(kept, f"@table.{len(self._constants)}")
 
     def _gather(self, value: Value) -> str:

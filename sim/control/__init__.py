@@ -15,17 +15,19 @@ from ..effects import NO_EFFECTS, EffectOptions
 from ..state import Array, WorldState, clip, stack, total
 from .cascade import AroundHover, Attitude, Numbers, Position, Rates, Velocity
 from .gains import Gains, shared_ranges
+from .wrench import Wrench
 
 _CASCADE: dict[str, type[Rates]] = {
+    "wrench": Wrench,
     "rates": Rates,
     "attitude": Attitude,
     "velocity": Velocity,
     "position": Position,
 }
 LEVELS = ("rotors", *_CASCADE, "increment", "offset")
-"""What an action may set: the thrust of each rotor; collective thrust and body rates; collective
-thrust, roll, pitch and yaw rate; velocity and yaw rate; position and heading; a change of all
-thrusts; all thrusts."""
+"""What an action may set: the thrust of each rotor; accelerations, alike for every craft;
+collective thrust and body rates; collective thrust, roll, pitch and yaw rate; velocity and yaw
+rate; position and heading; a change of all thrusts; all thrusts."""
 SHARES = {"increment": 0.05, "offset": 0.2}
 """Thrust of one unit of action over the rotors' largest thrust."""
 _CONSTANTS = (
@@ -155,11 +157,14 @@ def make_controller(
     """
     if level not in LEVELS:
         raise InputError(f"action: expected one of {', '.join(LEVELS)}, got {shortened(level)}")
+    if hasattr(vehicle, "table") and level != "wrench":
+        raise InputError(f"action: expected wrench with craft of {vehicle.name}, got {level}")
     members = getattr(vehicle, "members", (vehicle,))
     kinds = list(dict.fromkeys(members))
     controllers: list[Controller]
     if level in _CASCADE:
-        gains = [Gains.of(kind, period, lag_of(kind, effects)) for kind in kinds]
+        leads = level != "wrench"
+        gains = [Gains.of(kind, period, leads * lag_of(kind, effects)) for kind in kinds]
         pairs = zip(kinds, shared_ranges(gains), strict=True)
         controllers = [_CASCADE[level](kind, own, effects) for kind, own in pairs]
     else:

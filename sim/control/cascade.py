@@ -18,6 +18,7 @@ Array code with any leading axes.
 
 import math
 from functools import reduce
+from typing import Any
 
 import numpy as np
 
@@ -114,29 +115,7 @@ class Rates:
         roll, pitch, yaw = times(self._inertia, wanted)
         u, v, w = times(self._inertia, (p, q, r))
         torque = roll + (q * w - r * v), pitch + (r * u - p * w), yaw + (p * v - q * u)
-        return self._driven(self.mixed(collective, torque), state)
-
-    def mixed(self, collective: Array, torque: Parts) -> list[Array]:
-        """Thrust of each rotor, N, for a collective thrust, N, and a torque, N·m."""
-        gains = self.gains
-        roll, pitch, yaw = torque
-        low = gains.lowest
-        high = gains.highest
-        added = [a * roll + b * pitch for a, b, _ in gains.mix]
-        lower = reduce(np.minimum, added)
-        upper = reduce(np.maximum, added)
-        scale = clip((high - low) / clip(upper - lower, 1e-9 * high, math.inf), 0.0, 1.0)
-        least = low - scale * lower
-        most = high - scale * upper
-        middle = reduce(np.minimum, [reduce(np.maximum, [collective + 0.0 * least, least]), most])
-        parts = [middle + scale * part for part in added]
-        yaws = [(part, c) for part, (*_, c) in zip(parts, gains.mix, strict=True) if c]
-        ends = [((low - part) / c, (high - part) / c)[:: 1 if c > 0 else -1] for part, c in yaws]
-        # Where there is no room, the upper end holds.
-        yaw = reduce(np.maximum, [yaw, *(end for end, _ in ends)])
-        yaw = reduce(np.minimum, [yaw, *(end for _, end in ends)])
-        rotors = zip(gains.share, parts, gains.mix, strict=True)
-        return [share * (part + c * yaw) for share, part, (*_, c) in rotors]
+        return self._driven(mixed(self.gains, collective, torque), state)
 
     def _driven(self, wanted: list[Array], state: WorldState) -> Array:
         """Commands that make rotors with a lag and a thrust curve give these thrusts."""
@@ -276,6 +255,37 @@ class Position(Velocity):
         """Velocity over offset, 1/s."""
         braked = square_root(0.5 * acceleration / distance)
         return clip(reduce(np.minimum, [braked, speed / distance]), 0.0, self.gains.position)
+
+
+def mixed(craft: Any, collective: Array, torque: Parts) -> list[Array]:
+    """Thrust of each rotor, N, for a collective thrust, N, and a torque, N·m.
+
+    Of the craft it needs `lowest`, `highest`, `mix` and `share`, as `Gains` has them: numbers, or
+    arrays where craft differ.
+    """
+    roll, pitch, yaw = torque
+    low = craft.lowest
+    high = craft.highest
+    added = [a * roll + b * pitch for a, b, _ in craft.mix]
+    lower = reduce(np.minimum, added)
+    upper = reduce(np.maximum, added)
+    scale = clip((high - low) / clip(upper - lower, 1e-9 * high, math.inf), 0.0, 1.0)
+    least = low - scale * lower
+    most = high - scale * upper
+    middle = reduce(np.minimum, [reduce(np.maximum, [collective + 0.0 * least, least]), most])
+    parts = [middle + scale * part for part in added]
+    yaws = [(part, c) for part, (*_, c) in zip(parts, craft.mix, strict=True) if _turns(c)]
+    ends = [((low - part) / c, (high - part) / c) for part, c in yaws]
+    # Where there is no room, the upper end holds.
+    yaw = reduce(np.maximum, [yaw, *(np.minimum(*both) for both in ends)])
+    yaw = reduce(np.minimum, [yaw, *(np.maximum(*both) for both in ends)])
+    rotors = zip(craft.share, parts, craft.mix, strict=True)
+    return [share * (part + c * yaw) for share, part, (*_, c) in rotors]
+
+
+def _turns(yaw: Array) -> bool:
+    """Whether a rotor takes part in yaw."""
+    return not isinstance(yaw, float) or yaw != 0.0
 
 
 def _throttle(curve: Numbers) -> np.ndarray:

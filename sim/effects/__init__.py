@@ -73,7 +73,7 @@ class Effects(Kept):
         Factors of the drawn parameters by name, (W, A), for all worlds. Returns the thrusts of the
         worlds that begin, (W, A, R), N.
         """
-        self.take(factors)
+        self.take(factors, state.craft)
         thrust = state.thrust
         if self.on_rotors:
             thrust = self.rotors.begin(mask, thrust, factors)
@@ -95,10 +95,10 @@ class Effects(Kept):
             return self._wind
         return add(self._wind, self._gusts.velocity)
 
-    def take(self, factors: ByName) -> None:
-        """Take factors as of `begin`."""
+    def take(self, factors: ByName, craft: Array = None) -> None:
+        """Take factors as of `begin`, and the numbers of drawn craft, `WorldState.craft`."""
         if self.on_rotors:
-            self.rotors.take(factors)
+            self.rotors.take(factors, craft)
         if self.on_body:
             self.air.take(factors)
         if self._is_pushed:

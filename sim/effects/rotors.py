@@ -4,6 +4,7 @@ import numpy as np
 
 from ... import models
 from ...models import InputError
+from ...models.drawn import columns
 from ..elementary import expm1, polynomial
 from ..snapshots import Kept
 from ..state import Array, ByName, chosen, clip, square_root, stack, total
@@ -95,8 +96,8 @@ class RotorEffects(Kept):
             self.voltage = chosen(mask, self._terminal(), self.voltage)
         return self._scaled(thrust)
 
-    def take(self, factors: ByName) -> None:
-        """Take the factors of drawn parameters, (W, A), by name."""
+    def take(self, factors: ByName, craft: Array = None) -> None:
+        """Take the factors of drawn parameters, (W, A), by name, and the numbers of drawn craft."""
         options = self._options
         self._scales: list[Array] = []
         if options.efficiency:
@@ -106,7 +107,7 @@ class RotorEffects(Kept):
         if factors.keys() & set(self.names):
             self._scales.append(stack([factors.get(name, 1.0) for name in self.names]))
         if options.motor_lag:
-            times = self._times
+            times = self._times if craft is None else [columns(craft)["lag"]]
             if "time_constant" in factors:
                 times = [time * factors["time_constant"][..., None] for time in times]
             self._answers = [self._answer(time) for time in times]

@@ -1,0 +1,100 @@
+"""The level wrench: an acceleration along body z and three angular ones, alike for every craft.
+
+What a policy says is then no share of what one craft can do: the vehicle's file turns it into
+thrusts. Array code with any leading axes.
+"""
+
+from typing import Any, NamedTuple
+
+from ... import models
+from ...models.drawn import columns
+from ...models.matrices import inverse, times
+from ..effects import EffectOptions
+from ..state import Array, WorldState, parts_of, total
+from .cascade import Numbers, Rates, mixed
+from .gains import Gains
+
+SIZES = (20.0, 150.0, 150.0, 30.0)
+"""Of actions of 1: acceleration beyond a hover's, m/s², and angular accelerations, rad/s²."""
+
+
+class Plant(NamedTuple):
+    """A craft: numbers, or arrays where craft are drawn."""
+
+    mass: Array
+    """kg."""
+    inertia: Any
+    """Three rows, kg·m²."""
+    turn: Any
+    """Its inverse."""
+    torques: Any
+    """Of one newton of each rotor, N·m, three rows of R."""
+    lowest: Array
+    """As `Gains` has it; so are those that follow."""
+    highest: Array
+    mix: Any
+    share: Any
+
+
+class Wrench(Rates):
+    """Acceleration along body z, and angular accelerations about the body's axes.
+
+    Torque = J · angular acceleration; mixed as `Rates` has it, once in a control step.
+    """
+
+    every_step = False
+    components = ("lift", "roll acceleration", "pitch acceleration", "yaw acceleration")
+    units = ("m/s²", "rad/s²", "rad/s²", "rad/s²")
+
+    def __init__(self, vehicle: "models.Vehicle", gains: Gains, effects: EffectOptions) -> None:
+        super().__init__(vehicle, gains, effects)
+        self._plant = Plant(
+            mass=vehicle.mass,
+            inertia=vehicle.inertia.tolist(),
+            turn=inverse(vehicle.inertia).tolist(),
+            torques=vehicle.allocation[1:].tolist(),
+            lowest=gains.lowest,
+            highest=gains.highest,
+            mix=gains.mix,
+            share=gains.share,
+        )
+
+    def sizes(self, gains: Gains) -> Numbers:
+        """See `SIZES`."""
+        return SIZES
+
+    def thrust(self, action: Array, state: WorldState) -> Array:
+        """As `Controller.thrust`."""
+        lift, *turns = self._scaled(action)
+        plant = self._plant_of(state)
+        torque = times(plant.inertia, turns)
+        return self._driven(mixed(plant, plant.mass * (self._gravity + lift), torque), state)
+
+    def applied(self, state: WorldState) -> list[Array]:
+        """The action that the present commands stand for, four numbers, each (W, A)."""
+        plant = self._plant_of(state)
+        command = parts_of(state.command)
+        collective = total(state.command)
+        torque = [sum(a * b for a, b in zip(row, command, strict=True)) for row in plant.torques]
+        found = (collective / plant.mass - self._gravity, *times(plant.turn, torque))
+        return [value / size for value, size in zip(found, SIZES, strict=True)]
+
+    def _plant_of(self, state: WorldState) -> Plant:
+        return self._plant if state.craft is None else _drawn_plant(state.craft)
+
+
+def _drawn_plant(craft: Array) -> Plant:
+    """Of drawn craft, as of `WorldState.craft`."""
+    numbers = {name: parts_of(part) for name, part in columns(craft).items()}
+    x, y, z = numbers["inertia"]
+    mix = numbers["mix"]
+    return Plant(
+        mass=1.0,
+        inertia=((x, 0.0, 0.0), (0.0, y, 0.0), (0.0, 0.0, z)),
+        turn=((1.0 / x, 0.0, 0.0), (0.0, 1.0 / y, 0.0), (0.0, 0.0, 1.0 / z)),
+        torques=(numbers["y"], [-one for one in numbers["x"]], numbers["yaw"]),
+        lowest=0.0,
+        highest=numbers["highest"][0],
+        mix=[mix[i : i + 3] for i in range(0, len(mix), 3)],
+        share=numbers["share"],
+    )
