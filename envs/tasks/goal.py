@@ -125,7 +125,7 @@ class GoalTask(NumbersTask):
     Goal minus position, m; velocity, m/s; the directions of body x, the nose, and of body z, the
     thrust: all in the world, turned by the wanted heading. Then the body rates, rad/s, and the
     thrust of each rotor over its hover thrust, minus 1; with the action `wrench` the four numbers
-    of the action that the rotors were commanded to give take their place. `docs/observations.md`
+    of the action that the thrusts stand for take their place. `docs/observations.md`
     lists the numbers of every task by index.
 
     Numbers are clipped: positions at twice the flight band, speeds at 100 m/s, rates at 100 rad/s.
@@ -166,7 +166,7 @@ class GoalTask(NumbersTask):
         """What is seen of the rotors."""
         if hasattr(self.controller, "applied"):
             return [
-                Number(f"applied {name}", "1", -3.0, 3.0) for name in self.controller.components
+                Number(f"{name} in actions", "1", -3.0, 3.0) for name in self.controller.components
             ]
         vehicle = self.vehicle
         # Of any vehicle, where there are several.

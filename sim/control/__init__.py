@@ -163,8 +163,7 @@ def make_controller(
     kinds = list(dict.fromkeys(members))
     controllers: list[Controller]
     if level in _CASCADE:
-        leads = level != "wrench"
-        gains = [Gains.of(kind, period, leads * lag_of(kind, effects)) for kind in kinds]
+        gains = [Gains.of(kind, period, lag_of(kind, effects)) for kind in kinds]
         pairs = zip(kinds, shared_ranges(gains), strict=True)
         controllers = [_CASCADE[level](kind, own, effects) for kind, own in pairs]
     else:

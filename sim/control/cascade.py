@@ -17,6 +17,7 @@ Array code with any leading axes.
 """
 
 import math
+from collections.abc import Sequence
 from functools import reduce
 from typing import Any
 
@@ -115,15 +116,20 @@ class Rates:
         roll, pitch, yaw = times(self._inertia, wanted)
         u, v, w = times(self._inertia, (p, q, r))
         torque = roll + (q * w - r * v), pitch + (r * u - p * w), yaw + (p * v - q * u)
-        return self._driven(mixed(self.gains, collective, torque), state)
+        gains = self.gains
+        thrusts = mixed(gains, collective, torque)
+        return self._driven(thrusts, state, gains.lead, self._high)
 
-    def _driven(self, wanted: list[Array], state: WorldState) -> Array:
-        """Commands that make rotors with a lag and a thrust curve give these thrusts."""
-        lead = self.gains.lead
-        if lead != 1.0:
+    def _driven(
+        self, wanted: list[Array], state: WorldState, lead: Array, most: Sequence[Array]
+    ) -> Array:
+        """Commands, at most so many newtons, that make rotors with a lag and a thrust curve give
+        these thrusts.
+        """
+        if not isinstance(lead, float) or lead != 1.0:
             now = parts_of(state.thrust)
             wanted = [old + lead * (new - old) for old, new in zip(now, wanted, strict=True)]
-        commands = list(map(clip, wanted, self._low, self._high))
+        commands = list(map(clip, wanted, self._low, most))
         table = self._throttle
         if table is not None:
             both = zip(commands, self._high, strict=True)

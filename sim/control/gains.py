@@ -31,7 +31,7 @@ from ...models import InputError
 from ...models.fields import immutable
 from ...models.matrices import right_inverse
 from ..elementary import atan2, cos, expm1, sin
-from ..state import total
+from ..state import Array, total
 
 LEAD = 3.0
 """Rotors are driven to follow this many times faster than their own lag."""
@@ -106,9 +106,7 @@ class Gains:
         room = max(min(highest - weight, weight - lowest), LEAST_ROOM * (highest - lowest))
         torques = total(mix[:, np.newaxis] * vehicle.inertia)
         alpha = room / np.abs(torques).max(axis=0)
-        # With a lag the rotors follow in `answer`; a step of them is exact: 1 - exp(-t / time).
         answer = max(lag / LEAD, period) if lag > 0 else 0.0
-        lead = expm1(-period / answer) / expm1(-period / lag) if lag > 0 else 1.0
         fastest = 1 / (5 * (answer + period))
         p = min(fastest, math.sqrt(min(alpha[0], alpha[1]) / 2))
         yaw = min(fastest, math.sqrt(alpha[2] / 2))
@@ -125,7 +123,7 @@ class Gains:
             heading=yaw,
             velocity=p / 2,
             position=p / 5,
-            lead=lead,
+            lead=lead_of(lag, period) if lag > 0 else 1.0,
             most_rate=tuple(np.sqrt(math.pi * alpha).tolist()),
             most_tilt=tilt,
             most_acceleration=most,
@@ -137,6 +135,14 @@ class Gains:
             mix=tuple(map(tuple, mix.tolist())),
             share=tuple(share.tolist()),
         )
+
+
+def lead_of(lag: Array, period: float) -> Array:
+    """Change of a rotor's command per wanted change of its thrust, for a lag above 0, s: it then
+    follows `LEAD` times faster. A step is exact: 1 - exp(-t / time).
+    """
+    answer = np.maximum(lag / LEAD, period)
+    return expm1(-period / answer) / expm1(-period / lag)
 
 
 def shared_ranges(several: Sequence[Gains]) -> list[Gains]:

@@ -12,7 +12,7 @@ from ...models.matrices import inverse, times
 from ..effects import EffectOptions
 from ..state import Array, WorldState, parts_of, total
 from .cascade import Numbers, Rates, mixed
-from .gains import Gains
+from .gains import Gains, lead_of
 
 SIZES = (20.0, 150.0, 150.0, 30.0)
 """Of actions of 1: acceleration beyond a hover's, m/s², and angular accelerations, rad/s²."""
@@ -34,15 +34,17 @@ class Plant(NamedTuple):
     highest: Array
     mix: Any
     share: Any
+    lead: Array
+    most: Any
+    """Of each rotor, N."""
 
 
 class Wrench(Rates):
     """Acceleration along body z, and angular accelerations about the body's axes.
 
-    Torque = J · angular acceleration; mixed as `Rates` has it, once in a control step.
+    Torque = J · angular acceleration; thrusts are mixed, and rotors driven, as those of `Rates`.
     """
 
-    every_step = False
     components = ("lift", "roll acceleration", "pitch acceleration", "yaw acceleration")
     units = ("m/s²", "rad/s²", "rad/s²", "rad/s²")
 
@@ -57,7 +59,10 @@ class Wrench(Rates):
             highest=gains.highest,
             mix=gains.mix,
             share=gains.share,
+            lead=gains.lead,
+            most=self._high,
         )
+        self._period = vehicle.timestep if effects.motor_lag else 0.0
 
     def sizes(self, gains: Gains) -> Numbers:
         """See `SIZES`."""
@@ -68,33 +73,37 @@ class Wrench(Rates):
         lift, *turns = self._scaled(action)
         plant = self._plant_of(state)
         torque = times(plant.inertia, turns)
-        return self._driven(mixed(plant, plant.mass * (self._gravity + lift), torque), state)
+        thrusts = mixed(plant, plant.mass * (self._gravity + lift), torque)
+        return self._driven(thrusts, state, plant.lead, plant.most)
 
     def applied(self, state: WorldState) -> list[Array]:
-        """The action that the present commands stand for, four numbers, each (W, A)."""
+        """The action that the present thrusts stand for, four numbers, each (W, A)."""
         plant = self._plant_of(state)
-        command = parts_of(state.command)
-        collective = total(state.command)
-        torque = [sum(a * b for a, b in zip(row, command, strict=True)) for row in plant.torques]
+        thrusts = parts_of(state.thrust)
+        collective = total(state.thrust)
+        torque = [sum(a * b for a, b in zip(row, thrusts, strict=True)) for row in plant.torques]
         found = (collective / plant.mass - self._gravity, *times(plant.turn, torque))
         return [value / size for value, size in zip(found, SIZES, strict=True)]
 
     def _plant_of(self, state: WorldState) -> Plant:
-        return self._plant if state.craft is None else _drawn_plant(state.craft)
+        return self._plant if state.craft is None else _drawn_plant(state.craft, self._period)
 
 
-def _drawn_plant(craft: Array) -> Plant:
-    """Of drawn craft, as of `WorldState.craft`."""
+def _drawn_plant(craft: Array, period: float) -> Plant:
+    """Of drawn craft, as of `WorldState.craft`; rotors with a lag are driven so often, s."""
     numbers = {name: parts_of(part) for name, part in columns(craft).items()}
     x, y, z = numbers["inertia"]
     mix = numbers["mix"]
+    (highest,) = numbers["highest"]
     return Plant(
         mass=1.0,
         inertia=((x, 0.0, 0.0), (0.0, y, 0.0), (0.0, 0.0, z)),
         turn=((1.0 / x, 0.0, 0.0), (0.0, 1.0 / y, 0.0), (0.0, 0.0, 1.0 / z)),
         torques=(numbers["y"], [-one for one in numbers["x"]], numbers["yaw"]),
         lowest=0.0,
-        highest=numbers["highest"][0],
+        highest=highest,
         mix=[mix[i : i + 3] for i in range(0, len(mix), 3)],
         share=numbers["share"],
+        lead=lead_of(numbers["lag"][0], period) if period else 1.0,
+        most=[highest * share for share in numbers["share"]],
     )

@@ -23,7 +23,7 @@ from rotorgram.sim import (
     make_world,
 )
 from rotorgram.sim.control import MixedController
-from rotorgram.sim.control.cascade import Position
+from rotorgram.sim.control.cascade import Position, mixed
 from rotorgram.sim.control.gains import Gains, shared_ranges
 from tables import SIM
 from worlds import alone, begin
@@ -120,9 +120,9 @@ def test_thrusts_by_hand(table: dict[str, Any]) -> None:
 
 
 def test_mixing_keeps_roll_and_pitch_before_collective_and_that_before_yaw() -> None:
-    controller: Any = make_controller("rates", Vehicle.load(), 0.01)
+    gains = Gains.of(Vehicle.load(), 0.01)
     for (collective, *torque), expected in SIM["mixed"]["rows"]:
-        found = controller.mixed(collective, torque)
+        found = mixed(gains, collective, torque)
         assert found == approx(expected, abs=1e-6)
 
 
