@@ -6,6 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
+from .. import agents
 from ..agents import (
     CONTROLLERS,
     Checkpoint,
@@ -27,6 +28,8 @@ if TYPE_CHECKING:
     from ..udp import RemoteVectorEnv
 
 CHECKPOINT = "checkpoint.safetensors"
+UNIVERSAL = Path(agents.__file__).parent / "universal.safetensors"
+"""A policy that flies every craft: `studies/universal.py` trained it."""
 F = TypeVar("F", bound=EnvFlags)
 _CONNECT_TIMEOUT = 30 * 24 * 3600.0  # s: Ctrl-C ends the wait for a simulator
 
@@ -38,7 +41,7 @@ def load_pilot(name: str) -> Pilot:
     """A controller, or what `trained` gives. Raises `InputError`."""
     if is_controller(name):
         return find_controller(name)
-    return trained(name, *CONTROLLERS, "FILE.py:CLASS of a controller")
+    return trained(name, UNIVERSAL.stem, *CONTROLLERS, "FILE.py:CLASS of a controller")
 
 
 def trained(name: str, *others: str) -> Checkpoint:
@@ -54,8 +57,10 @@ def trained(name: str, *others: str) -> Checkpoint:
 
 
 def checkpoint_file(name: str) -> Path:
-    """The file of a checkpoint, or of a training's folder."""
+    """The file of a checkpoint, of a training's folder, or of the policy `universal`."""
     path = Path(name)
+    if name == UNIVERSAL.stem and not path.exists():
+        return UNIVERSAL
     return path / CHECKPOINT if path.is_dir() else path
 
 

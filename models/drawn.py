@@ -23,7 +23,8 @@ MOST = 4096
 """Most craft of a pool."""
 POOL = "drawn:0-2047"
 """What `drawn` stands for."""
-_GRAVITY = 9.81
+GRAVITY = 9.81
+"""Of a drawn craft's file, m/s²."""
 _LEAST_LAG = 1e-4  # s
 _MIDDLE = {"mass": math.log(50) / math.log(1000), "six": 0.0}  # of 1 kg, with six rotors
 _RANGES = read_own_toml(__file__, "drawn")
@@ -171,7 +172,7 @@ def table_of(craft: Craft) -> np.ndarray:
         "yaw": yaw,
         "share": there / count,
         "mix": mix.reshape(len(x), -1),
-        "highest": craft.thrust_to_weight[:, None] * _GRAVITY,
+        "highest": craft.thrust_to_weight[:, None] * GRAVITY,
         "lag": craft.lag[:, None],
     }
     return np.concat([parts[name] for name in _WIDTHS], axis=1)
@@ -181,7 +182,7 @@ def _file_of(name: str, craft: Craft) -> Path:
     """A TOML file of the first of some craft."""
     mass = float(craft.mass[0])
     there = np.flatnonzero(craft.turn[0]).tolist()
-    thrust = float(craft.thrust_to_weight[0]) * mass * _GRAVITY / len(there)
+    thrust = float(craft.thrust_to_weight[0]) * mass * GRAVITY / len(there)
     turns = {1.0: "cw", -1.0: "ccw"}
     rotors = [
         f'[[rotors.list]]\nname = "rotor{i + 1}"\nturn = "{turns[craft.turn[0, i]]}"\n'
@@ -190,7 +191,7 @@ def _file_of(name: str, craft: Craft) -> Path:
     ]
     text = f"""name = "{name}"
 timestep = 0.005
-gravity = {_GRAVITY}
+gravity = {GRAVITY}
 
 [body]
 mass = {mass}

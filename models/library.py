@@ -64,7 +64,7 @@ def find_vehicle(vehicle: Path | str | None) -> Path:
     if not isinstance(vehicle, str | Path) or (is_no_file and not os.path.isfile(word)):
         known = ", ".join(vehicle_names())
         raise InputError(
-            f"vehicle: expected a file, drawn:NUMBER, or one of {known}, got {word!r:.300}"
+            f"vehicle: expected a file, or one of {known} or drawn:NUMBER, got {word!r:.300}"
         )
     if path.suffix.lower() == ".urdf":
         raise InputError(
