@@ -541,7 +541,8 @@ def test_bare_names_are_of_the_library(tmp_path: Path, monkeypatch: pytest.Monke
     vehicle = Vehicle.load("mine")
     assert vehicle.name == "mine"
     assert vehicle.path == tmp_path / "mine" / "vehicle.toml"
-    with pytest.raises(InputError, match=r"^vehicle: expected a file, or one of mine or drawn:NUMBER, got 'yours'"):
+    sentence = r"^vehicle: expected a file, or one of mine or drawn:NUMBER, got 'yours'"
+    with pytest.raises(InputError, match=sentence):
         Vehicle.load("yours")
 
 
