@@ -4,6 +4,7 @@ Knows nothing of tasks, rewards or Gymnasium.
 """
 
 from .control import LEVELS, CollectiveThrust, Controller, make_controller
+from .control.wrench import SEEN, Wrench
 from .effects import EffectOptions
 from .elementary import atan2, cos, exp, log, power, sin, wrapped
 from .random import Draw
@@ -27,6 +28,7 @@ from .world import PhysicsError, World, make_world
 __all__ = [
     "LEVELS",
     "PARAMETERS",
+    "SEEN",
     "Array",
     "CollectiveThrust",
     "Controller",
@@ -37,6 +39,7 @@ __all__ = [
     "Randomization",
     "World",
     "WorldState",
+    "Wrench",
     "atan2",
     "body_x",
     "body_z",

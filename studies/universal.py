@@ -5,16 +5,14 @@
 
 Each seed trains by `rotorgram train ppo --config studies/universal.toml`; the clock runs from
 before the process starts to after it has ended. The policy flies craft that no training saw,
-`drawn:100000-104095`, each craft of the library, with its own lag of the rotors where its file has
-one, and the heavy hexacopter without it: from the starts of Hover-v0, and thrown. A throw begins at
-the goal, at any attitude, with up to 2 m/s and 8 rad/s along and about each axis, 4 rad/s about z.
-`raptor` flies the quadcopters of the library and `--peers` drawn ones from the same starts, ten
-flights each.
+`drawn:100000-104095`, and each craft of the library, with the lag of its rotors where its file has
+one: in Hover-v0, and thrown, in Recovery-v0. `raptor` flies the quadcopters of the library and
+`--peers` drawn ones from the same starts, ten flights each, beside the policy of the first seed.
+That one becomes `agents/universal.safetensors`.
 
-The policy of the first seed becomes `agents/universal.safetensors`, with the starts of Hover-v0.
 `docs/results/universal_flights.npz` gets the steady error of every flight in millimetres, 65535 of
-one that crashed, and the craft of each, from which `--only-sums` computes
-`docs/results/universal.json` again.
+one that crashed or was not recovered at its end, and the craft of each, from which `--only-sums`
+computes `docs/results/universal.json` again.
 """
 
 import subprocess
@@ -33,6 +31,7 @@ from rotorgram.agents.checkpoints import store
 from rotorgram.cli._env import CHECKPOINT, UNIVERSAL
 from rotorgram.envs import LocalVectorEnv
 from rotorgram.envs.config import EnvConfig
+from rotorgram.envs.registry import task_type
 from rotorgram.flights.crowd import fly_crowd
 from rotorgram.flights.trajectories import evaluation_seed
 from rotorgram.models import Vehicle
@@ -40,7 +39,6 @@ from rotorgram.models.drawn import GRAVITY, columns, drawn_craft, range_of, tabl
 from rotorgram.models.library import vehicle_names
 from rotorgram.training.statistics import share_interval
 
-TASK = "rotorgram/Hover-v0"
 CONFIG = Path(__file__).with_suffix(".toml")
 FILE = RESULTS / "universal.json"
 FLIGHTS = RESULTS / "universal_flights.npz"
@@ -52,20 +50,22 @@ SETTINGS = (
     "hidden=[64,64]", "steps_per_update=16384", "learning_rate=0.004",
     "critic_learning_rate=0.012",
 )  # fmt: skip
-GOAL = (0.0, 0.0, 20.0)
-THROW = {
-    "start_tilt": "uniform(0, 180)", "start_axis": "uniform(-180, 180)",
-    "start_vx": "uniform(-2, 2)", "start_vy": "uniform(-2, 2)", "start_vz": "uniform(-2, 2)",
-    "start_wx": "uniform(-8, 8)", "start_wy": "uniform(-8, 8)", "start_wz": "uniform(-4, 4)",
-}  # fmt: skip
-THROWN = {"flight_band": 15.0, "start_band": 0.0, "start_heading": 180.0, "episode_length": 400}
-STARTS = {"hover": ({}, {}), "throws": (THROWN, THROW)}
+STARTS = {"hover": "rotorgram/Hover-v0", "throws": "rotorgram/Recovery-v0"}
 
 
 def trained(seed: int, env_steps: int, folder: Path) -> float:
     """Train; wall time of the process, s."""
     words = ["train", "ppo", "--config", str(CONFIG), "--preset", "robust", "--set", *SETTINGS]
-    words += ["--num-envs", "512", "--env-steps", str(env_steps), "--seed", str(seed)]
+    words += [
+        "--preset-of",
+        STARTS["hover"],
+        "--num-envs",
+        "512",
+        "--env-steps",
+        str(env_steps),
+        "--seed",
+        str(seed),
+    ]
     began = time.perf_counter()
     subprocess.run([sys.executable, "-m", "rotorgram.cli", *words, "--out", str(folder)],
                    check=True, stdout=subprocess.DEVNULL)  # fmt: skip
@@ -75,7 +75,7 @@ def trained(seed: int, env_steps: int, folder: Path) -> float:
 def publish(file: Path) -> None:
     """Keep the policy alone, in Hover-v0 as it is, with nothing drawn but the craft."""
     plain = EnvConfig.from_keywords(
-        TASK, vehicle="drawn", action="wrench", frame="body", backend="rigid"
+        STARTS["hover"], vehicle="drawn", action="wrench", frame="body", backend="rigid"
     )
     with closing(LocalVectorEnv(plain, 1, autoreset_mode="Disabled")) as env:
         alone = replace(load(file).policy_alone(), spec=env.env_spec, env=plain.resolve())
@@ -83,31 +83,38 @@ def publish(file: Path) -> None:
 
 
 def flown(pilot: Any, vehicle: str, starts: str, flights: int) -> np.ndarray:
-    """Steady errors of flights, mm, uint16, from starts that no training has.
+    """Steady errors of flights, mm, uint16, from starts that no training has; of a throw, which has
+    to be `recovered` at its end, none.
 
-    Rotors lag where the vehicle's file says by how much; drawn craft of a pool get half of their
+    Rotors lag where the vehicle's file says by how much; half of the craft of a pool get their
     actions a control step late.
     """
-    task, randomize = STARTS[starts]
-    keywords: dict[str, Any] = {"goal": GOAL, "backend": "rigid", "episode_length": 250, **task}
+    keywords: dict[str, Any] = {"backend": "rigid"}
     if vehicle == UNSEEN:
-        randomize = {**randomize, "action_delay": "uniform(0, 1)"}
-    lags = vehicle == UNSEEN or Vehicle.load(vehicle).coefficients["rotors.time_constant"]
-    if lags:
+        keywords["randomize"] = {"action_delay": "uniform(0, 1)"}
+    if vehicle == UNSEEN or Vehicle.load(vehicle).coefficients["rotors.time_constant"]:
         keywords["effects"] = {"motor_lag": True}
     if isinstance(pilot, Path):
         keywords |= {"action": "wrench", "frame": "body"}
+        if starts == "throws":
+            keywords["heading"] = 0.0
     else:
         keywords |= pilot.options
-        keywords["episode_length"] = round(keywords["episode_length"] * 0.02 / 0.01)
+        length = task_type(STARTS[starts]).episode_length
+        keywords["episode_length"] = round(length * 0.02 / keywords["control_period"])
     if flights < 100:
         keywords["compiled"] = False
-    config = EnvConfig.from_keywords(TASK, vehicle=vehicle, randomize=randomize, **keywords)
+    config = EnvConfig.from_keywords(STARTS[starts], vehicle=vehicle, **keywords)
     with closing(LocalVectorEnv(config, flights, autoreset_mode="Disabled")) as env:
         policy = load(pilot).policy() if isinstance(pilot, Path) else pilot(env.env_spec)
         flight = fly_crowd(env, policy, seeds_of(flights))
-    steady = np.minimum(np.rint(1000 * flight["steady"]), CRASHED - 1)
-    return np.where(flight["terminated"], CRASHED, steady).astype(np.uint16)
+    failed = flight["terminated"]
+    errors = flight["steady"]
+    if starts == "throws":
+        failed = failed | (flight["last"] < 0.5)
+        errors = 0 * errors
+    steady = np.minimum(np.rint(1000 * errors), CRASHED - 1)
+    return np.where(failed, CRASHED, steady).astype(np.uint16)
 
 
 def seeds_of(flights: int) -> list[int]:
@@ -118,7 +125,12 @@ def seeds_of(flights: int) -> list[int]:
 def craft_of(flights: int) -> np.ndarray:
     """Place in the pool of the craft of each flight."""
     config = EnvConfig.from_keywords(
-        TASK, vehicle=UNSEEN, action="wrench", backend="rigid", compiled=False, dtype="float64"
+        STARTS["hover"],
+        vehicle=UNSEEN,
+        action="wrench",
+        backend="rigid",
+        compiled=False,
+        dtype="float64",
     )
     with closing(LocalVectorEnv(config, flights, autoreset_mode="Disabled")) as env:
         env.reset(seed=seeds_of(flights))
@@ -159,8 +171,9 @@ def measure(args: Any) -> None:
                 for name in (UNSEEN, *vehicle_names()):
                     errors = flown(file, name, starts, args.flights)
                     found.setdefault(f"universal/{starts}/{name}", []).append(errors)
-                drawn = [flown(file, name, starts, 10) for name in peers]
-                found.setdefault(f"universal/{starts}/peers", []).append(np.concatenate(drawn))
+                if seed == args.first_seed:
+                    drawn = [flown(file, name, starts, 10) for name in peers]
+                    arrays[f"universal/{starts}/peers"] = np.concatenate(drawn)[None]
         print(seed, seconds[-1], flush=True)
         own = {name: np.array(errors) for name, errors in found.items()}
         np.savez_compressed(FLIGHTS, **arrays, **own, seconds=np.array(seconds))
@@ -243,8 +256,8 @@ def page(result: dict[str, Any]) -> str:
 def _shown(cell: dict[str, Any] | None) -> str:
     if cell is None:
         return "–"
-    share = 100 * cell["crashes"] / cell["flights"]
-    return f"{share:.2g} %; {100 * cell['median']:.2g}"
+    share = f"{100 * cell['crashes'] / cell['flights']:.2g} %"
+    return f"{share}; {100 * cell['median']:.2g}" if cell["median"] else share
 
 
 def main() -> None:

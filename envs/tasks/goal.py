@@ -9,8 +9,11 @@ import numpy as np
 from ...models import InputError
 from ...models.fields import Limits
 from ...sim import (
+    SEEN,
     Array,
     Draw,
+    Wrench,
+    atan2,
     body_x,
     body_z,
     clip,
@@ -22,12 +25,14 @@ from ...sim import (
     stack,
     to_body,
     world_z,
+    wrapped,
 )
 from ..spec import ArraySpec, Metric
 from ..state import State
 from .task import Outcome, Task
 
 ERROR_SCALE = 0.5  # Distance at which the reward for nearness crosses zero, m
+HEADING_WEIGHT = 0.2  # Cost of a heading half a turn off
 RATE_WEIGHT = 0.02  # Cost of a body rate of 1 rad/s
 PASSING_REWARD = 1.0  # Of a course: added in a step in which a point or gate is passed
 COURSE_RATE_WEIGHT = 0.002  # Of a course: cost of a body rate of 1 rad/s
@@ -124,8 +129,8 @@ class GoalTask(NumbersTask):
 
     Goal minus position, m; velocity, m/s; the directions of body x, the nose, and of body z, the
     thrust: all in the world, turned by the wanted heading. Then the body rates, rad/s, and the
-    thrust of each rotor over its hover thrust, minus 1; with the action `wrench` the four numbers
-    of the action that the thrusts stand for take their place. `docs/observations.md`
+    thrust of each rotor over its hover thrust, minus 1; with the action `wrench` the nine numbers
+    of `sim.control.SEEN` take their place. `docs/observations.md`
     lists the numbers of every task by index.
 
     Numbers are clipped: positions at twice the flight band, speeds at 100 m/s, rates at 100 rad/s.
@@ -164,10 +169,8 @@ class GoalTask(NumbersTask):
 
     def _thrusts(self) -> list[Number]:
         """What is seen of the rotors."""
-        if hasattr(self.controller, "applied"):
-            return [
-                Number(f"{name} in actions", "1", -3.0, 3.0) for name in self.controller.components
-            ]
+        if isinstance(self.controller, Wrench):
+            return [Number(name, "1", -3.0, 3.0) for name in SEEN]
         vehicle = self.vehicle
         # Of any vehicle, where there are several.
         weakest = np.atleast_2d(vehicle.thrust_low / vehicle.hover_thrust - 1).min(axis=0)
@@ -193,9 +196,8 @@ class GoalTask(NumbersTask):
             seen = (to_place, state.velocity, body_x(quaternion), body_z(quaternion))
             vectors = [self.turned(vector) for vector in seen]
         dtype = state.thrust.dtype
-        applied = getattr(self.controller, "applied", None)
-        if applied:
-            thrust = stack(applied(state)).astype(dtype)
+        if isinstance(self.controller, Wrench):
+            thrust = stack(self.controller.seen(state)).astype(dtype)
         else:
             thrust = state.thrust / np.asarray(self.vehicle.hover_thrust, dtype) - 1.0
         parts = [*vectors, state.body_rates, thrust, *self.further(state)]
@@ -228,6 +230,11 @@ class GoalTask(NumbersTask):
     def distance(self, state: State) -> Array:
         """From each drone to its goal, m, shape (W, A)."""
         return length(self.goal(state) - state.position)
+
+    def heading_error(self, state: State) -> Array:
+        """Of each nose from the wanted heading, degrees, (W, A)."""
+        x, y, _ = parts_of(body_x(state.quaternion))
+        return wrapped(atan2(y, x) - self.wanted) * (180 / math.pi)
 
     def place(self, state: State) -> Array:
         """Where each drone should be, world frame, m, shape (W, A, 3)."""
@@ -332,6 +339,11 @@ def row_of(rows: Array, index: Array) -> Array:
         return looked_up(rows, index)
     number = index.astype(int)
     return np.take_along_axis(rows, number[..., None, None], axis=-2)[..., 0, :]
+
+
+def heading_cost(error: Array) -> Array:
+    """Reward for an error of the heading, degrees."""
+    return -HEADING_WEIGHT / 180 * abs(error)
 
 
 def rates_cost(state: State, weight: float) -> Array:

@@ -10,11 +10,12 @@ import numpy as np
 
 from ...models.fields import Limits, immutable
 from ...scenes import SceneConfig
-from ...sim import Draw, InitialState, atan2, body_x, cos, exp, parts_of, sin, stack, wrapped
+from ...sim import Draw, InitialState, cos, exp, parts_of, sin, stack
 from ..spec import Metric
 from ..state import State
 from .goal import (
     ERROR_SCALE,
+    HEADING_WEIGHT,
     POSITION_ERROR,
     WORST_RATES,
     Distance,
@@ -26,12 +27,12 @@ from .goal import (
     at,
     check_cube,
     check_height,
+    heading_cost,
     nearness,
 )
 from .measures import METRICS, begin_measures, measures_of, update_measures
 from .task import Outcome, TaskOptions
 
-HEADING_WEIGHT = 0.2  # Cost of a heading half a turn off
 _LIDAR = {"model": "os0", "rows": 10, "columns": 48, "low": -30.0, "high": 45.0}
 _NEAR = 0.5  # cost of a step that touches; e times less each 0.5 m further off
 
@@ -123,13 +124,11 @@ class Hover(GoalTask):
     def outcome(self, state: State) -> Outcome:
         """Nearness to goal and heading; the end at a crash, a flip-over, or outside the band."""
         distance = self.distance(state)
-        x, y, _ = parts_of(body_x(state.quaternion))
-        off = atan2(y, x) - self.wanted
-        heading = wrapped(off) * (180 / math.pi)
+        heading = self.heading_error(state)
         crashed = self.crashed(state, distance > self.options.flight_band)
         terms = {
             "position": nearness(distance, self.near),
-            "heading": -HEADING_WEIGHT / 180 * abs(heading),
+            "heading": heading_cost(heading),
         }
         metrics = {"position_error": distance, "heading_error": heading}
         return self.judged(state, terms, crashed, metrics)

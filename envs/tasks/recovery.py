@@ -13,6 +13,7 @@ from .goal import (
     WORST_RATES,
     Frame,
     GoalTask,
+    Heading,
     Point,
     Size,
     SlowSpeed,
@@ -21,6 +22,7 @@ from .goal import (
     at,
     check_band,
     check_height,
+    heading_cost,
     nearness,
 )
 from .task import Outcome, TaskOptions
@@ -49,6 +51,8 @@ class RecoveryOptions(TaskOptions):
     """... and tilted by less than this, degrees."""
     flight_band: Size = 15.0
     """An episode terminates when the craft is further than this from its goal, m."""
+    heading: Heading | None = None
+    """Direction of the nose to come to rest in, degrees about z; none: any will do."""
     frame: Frame | None = None
     """Frame of the observation; by default that in which the action acts: `body` with the actions
     `rotors` and `rates`, `world` with the others."""
@@ -78,8 +82,9 @@ class Recovery(GoalTask):
     ## Reward
 
     (s - d) / (s + d) for the distance d to the goal with s = 1 m; -0.25 (1 - cosine of the tilt);
-    -0.02 s/rad times the size of the body rates, up to 20 rad/s; and -190 on the step that
-    terminates: a fall costs more than a slow recovery.
+    with the option `heading`, what its error costs in `Hover-v0`; -0.02 s/rad times the size of the
+    body rates, up to 20 rad/s; and -190 on the step that terminates: a fall costs more than a slow
+    recovery.
 
     ## Metrics
 
@@ -122,6 +127,8 @@ class Recovery(GoalTask):
         self.spin = np.minimum(options.spin, STOP_TIME * np.array(turning))
         usual = "body" if self.action in ("rotors", "rates") else "world"
         self.body = (options.frame or usual) == "body"
+        self.heads = options.heading is not None
+        self.wanted = math.radians(options.heading or 0.0)
         self.define_observation(options.flight_band)
         self._least_upright = cos(math.radians(options.upright))
 
@@ -165,6 +172,8 @@ class Recovery(GoalTask):
             "position": nearness(distance, ERROR_SCALE),
             "tilt": TILT_WEIGHT * (state.tilt_cosine - 1.0),
         }
+        if self.heads:
+            terms["heading"] = heading_cost(self.heading_error(state))
         metrics = {
             "recovered": self._recovered(state) * 1.0,
             "recovery_time": self.memory.missed,

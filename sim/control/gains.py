@@ -58,6 +58,8 @@ class Gains:
     """kᵥ: acceleration per error of the velocity, 1/s."""
     position: float
     """kₚ: velocity per error of the position, 1/s."""
+    lag: float
+    """Time constant of the rotors, s."""
     lead: float
     """Change of a rotor's command per wanted change of its thrust; 1 without a lag."""
     most_rate: tuple[float, float, float]
@@ -123,6 +125,7 @@ class Gains:
             heading=yaw,
             velocity=p / 2,
             position=p / 5,
+            lag=lag,
             lead=lead_of(lag, period) if lag > 0 else 1.0,
             most_rate=tuple(np.sqrt(math.pi * alpha).tolist()),
             most_tilt=tilt,

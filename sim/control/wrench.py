@@ -4,18 +4,26 @@ What a policy says is then no share of what one craft can do: the vehicle's file
 thrusts. Array code with any leading axes.
 """
 
+from functools import reduce
 from typing import Any, NamedTuple
+
+import numpy as np
 
 from ... import models
 from ...models.drawn import columns
 from ...models.matrices import inverse, times
 from ..effects import EffectOptions
-from ..state import Array, WorldState, parts_of, total
+from ..state import Array, WorldState, clip, parts_of, total
 from .cascade import Numbers, Rates, mixed
 from .gains import Gains, lead_of
 
 SIZES = (20.0, 150.0, 150.0, 30.0)
 """Of actions of 1: acceleration beyond a hover's, m/s², and angular accelerations, rad/s²."""
+LONGEST_LAG = 0.1  # s
+_ACTIONS = ("lift", "roll acceleration", "pitch acceleration", "yaw acceleration")
+SEEN = (*_ACTIONS, *(f"largest {name}" for name in _ACTIONS), "lag over 0.1 s")
+"""What a policy sees of the rotors: the action that their thrusts stand for, how much of each the
+craft can give from a hover, up to 1, and their lag."""
 
 
 class Plant(NamedTuple):
@@ -37,6 +45,8 @@ class Plant(NamedTuple):
     lead: Array
     most: Any
     """Of each rotor, N."""
+    lag: Array
+    """s."""
 
 
 class Wrench(Rates):
@@ -45,7 +55,7 @@ class Wrench(Rates):
     Torque = J · angular acceleration; thrusts are mixed, and rotors driven, as those of `Rates`.
     """
 
-    components = ("lift", "roll acceleration", "pitch acceleration", "yaw acceleration")
+    components = _ACTIONS
     units = ("m/s²", "rad/s²", "rad/s²", "rad/s²")
 
     def __init__(self, vehicle: "models.Vehicle", gains: Gains, effects: EffectOptions) -> None:
@@ -61,6 +71,7 @@ class Wrench(Rates):
             share=gains.share,
             lead=gains.lead,
             most=self._high,
+            lag=gains.lag,
         )
         self._period = vehicle.timestep if effects.motor_lag else 0.0
 
@@ -76,14 +87,26 @@ class Wrench(Rates):
         thrusts = mixed(plant, plant.mass * (self._gravity + lift), torque)
         return self._driven(thrusts, state, plant.lead, plant.most)
 
-    def applied(self, state: WorldState) -> list[Array]:
-        """The action that the present thrusts stand for, four numbers, each (W, A)."""
+    def seen(self, state: WorldState) -> list[Array]:
+        """What `SEEN` names, each (W, A)."""
         plant = self._plant_of(state)
         thrusts = parts_of(state.thrust)
-        collective = total(state.thrust)
         torque = [sum(a * b for a, b in zip(row, thrusts, strict=True)) for row in plant.torques]
-        found = (collective / plant.mass - self._gravity, *times(plant.turn, torque))
-        return [value / size for value, size in zip(found, SIZES, strict=True)]
+        hover = plant.mass * self._gravity
+        lift = (total(state.thrust) - hover) / plant.mass
+        room = np.minimum(plant.highest - hover, hover - plant.lowest)
+        most = [(plant.highest - hover) / plant.mass]
+        for axis in range(3):
+            pushes = [abs(row[axis]) for row in plant.mix]
+            most.append(room / (plant.inertia[axis][axis] * reduce(np.maximum, pushes)))
+        now = (lift, *times(plant.turn, torque))
+        own = [clip(value / size, 0.0, 1.0) for value, size in zip(most, SIZES, strict=True)]
+        zero = 0.0 * lift
+        return [
+            *(value / size for value, size in zip(now, SIZES, strict=True)),
+            *(zero + value for value in own),
+            zero + plant.lag / LONGEST_LAG,
+        ]
 
     def _plant_of(self, state: WorldState) -> Plant:
         return self._plant if state.craft is None else _drawn_plant(state.craft, self._period)
@@ -106,4 +129,5 @@ def _drawn_plant(craft: Array, period: float) -> Plant:
         share=numbers["share"],
         lead=lead_of(numbers["lag"][0], period) if period else 1.0,
         most=[highest * share for share in numbers["share"]],
+        lag=numbers["lag"][0] if period else 0.0,
     )

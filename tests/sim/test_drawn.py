@@ -98,6 +98,7 @@ def test_a_pool_flies_each_craft_as_it_flies_alone(effects: dict[str, bool]) -> 
         for row in env.loop.world.state.craft[:, 0]
     ]
     assert len(set(found)) > 3
+    seen = env.observations
     for world, number in enumerate(found):
         given = {**FREE, "goal": HIGH, "dtype": "float64", "effects": effects}
         alone = LocalVectorEnv(
@@ -108,6 +109,17 @@ def test_a_pool_flies_each_craft_as_it_flies_alone(effects: dict[str, bool]) -> 
             alone.advance(wrench)
             place = alone.loop.world.state.position[0, 0]
             np.testing.assert_allclose(together[step, world], place, rtol=0, atol=1e-6)
+        np.testing.assert_allclose(seen[world], alone.observations[0], rtol=0, atol=1e-5)
+
+
+def test_a_policy_is_told_what_the_craft_can_give() -> None:
+    """The paper's: 20 m/s² of lift, in actions; 196 N, half of 400, about hover give the rest, as
+    `test_gains_of_the_papers_craft` has it: 38.9993 and 0.97984 rad/s². No lag.
+    """
+    env, _ = flown("paper", 1, steps=1)
+    lift = (400 - 196) / 20 / 20
+    told = (lift, 38.9993 / 150, 38.9993 / 150, 0.97984 / 30, 0.0)
+    np.testing.assert_allclose(env.observations[0, -5:], told, rtol=1e-4)
 
 
 def test_compiled_pools_and_numpy_s_have_the_same_bits() -> None:
@@ -143,7 +155,7 @@ def test_a_wrench_is_an_acceleration_whatever_the_craft(vehicle: str) -> None:
     wrench = np.tile(np.float32((0.05, 0.02, -0.01, 0.01)), (3, 1))
     env.advance(wrench)
     world = env.loop.world
-    np.testing.assert_allclose(env.observations[:, -4:], wrench, atol=2e-6)
+    np.testing.assert_allclose(env.observations[:, -9:-5], wrench, atol=2e-6)
     turned = wrench[:, 1:] * (150.0, 150.0, 30.0) * 0.02
     np.testing.assert_allclose(world.state.body_rates[:, 0], turned, rtol=0.02, atol=1e-3)
 
