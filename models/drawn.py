@@ -127,7 +127,7 @@ def drawn_file(word: str) -> Path:
 
 _WIDTHS = {
     "inertia": 3, "center": 1, "x": SLOTS, "y": SLOTS, "yaw": SLOTS, "share": SLOTS,
-    "mix": 3 * SLOTS, "highest": 1, "lag": 1,
+    "mix": 3 * SLOTS, "highest": 1, "lag": 1, "turning": 3,
 }  # fmt: skip
 
 
@@ -136,7 +136,8 @@ def columns(rows: Any) -> Mapping[str, Any]:
 
     Per kilogram: `inertia`, kg·m²; `center`, height of the center of mass, m; `x`, `y`, `yaw`:
     place of each rotor, m, and its torque about z per thrust, N·m/N; `share` and `mix`, rotor by
-    rotor, `highest`: as `Gains` has them; `lag`, s.
+    rotor, `highest`: as `Gains` has them; `lag`, s; `turning`, the largest angular accelerations,
+    rad/s².
     """
     found = {}
     first = 0
@@ -164,16 +165,20 @@ def table_of(craft: Craft) -> np.ndarray:
         ),
         axis=-1,
     )
+    inertia = craft.inertia / craft.mass[:, None]
+    highest = craft.thrust_to_weight[:, None] * GRAVITY
+    pushes = [np.maximum(lever, 0.0).sum(axis=1) for lever in (y, x, yaw)]
     parts = {
-        "inertia": craft.inertia / craft.mass[:, None],
+        "inertia": inertia,
         "center": craft.center[:, None],
         "x": x,
         "y": y,
         "yaw": yaw,
         "share": there / count,
         "mix": mix.reshape(len(x), -1),
-        "highest": craft.thrust_to_weight[:, None] * GRAVITY,
+        "highest": highest,
         "lag": craft.lag[:, None],
+        "turning": highest / count * np.stack(pushes, axis=1) / inertia,
     }
     return np.concat([parts[name] for name in _WIDTHS], axis=1)
 

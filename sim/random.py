@@ -156,9 +156,12 @@ class Draw:
     Attributes:
         openings: Of a start, those of the layout of each world, as of `Scenery`, (W, 1, K, 6); None
             where it has none.
+        craft: Of a start, the drawn craft of each world, as of `WorldState.craft`; None where the
+            vehicle is one for all.
     """
 
     openings: Array = None
+    craft: Array = None
 
     def __init__(self, random: Random, use: int, mask: Mask, ahead: int = 0) -> None:
         self._random = random

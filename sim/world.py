@@ -129,6 +129,7 @@ class World(Kept, NotCopied):
         if self.scenery.openings.size:
             self.scenery.begin(self.random, mask, ahead=1)
             draw.openings = self.scenery.openings[:, None]
+        draw.craft = self._craft(mask, ahead=1)
         return draw
 
     def reset(self, mask: Array, pose: InitialState) -> None:
@@ -179,7 +180,9 @@ class World(Kept, NotCopied):
         rows = mask[..., None]
         self.random.begin(mask)
         self.scenery.begin(self.random, mask)
-        self._draw_craft(mask)
+        craft = self._craft(mask)
+        if craft is not None:
+            state.craft = chosen(mask, self._typed(craft), state.craft)
         self._draw_parameters(mask)
         begun = self._begun(mask, pose)
         self._move(begun, mask)
@@ -312,13 +315,13 @@ class World(Kept, NotCopied):
         """Follow the state and the attributes that were put back, and put back what is hidden."""
         raise NotImplementedError
 
-    def _draw_craft(self, mask: Array) -> None:
-        """Draw the craft of the worlds of a mask from the vehicle's pool, if it is one."""
+    def _craft(self, mask: Array, ahead: int = 0) -> Array:
+        """The craft of the episodes of a mask, (W, A, k), from the vehicle's pool, if it is one."""
         table = getattr(self.vehicle, "table", None)
-        if table is not None:
-            share = Draw(self.random, CRAFT, mask).uniform(0.0, len(table))
-            rows = looked_up(table, np.floor(share))
-            self.state.craft = chosen(mask, self._typed(rows), self.state.craft)
+        if table is None:
+            return None
+        place = Draw(self.random, CRAFT, mask, ahead).uniform(0.0, len(table))
+        return looked_up(table, np.floor(place))
 
     def _draw_parameters(self, mask: Array) -> None:
         """Draw the parameters of the worlds of a mask."""

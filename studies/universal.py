@@ -48,7 +48,7 @@ NAMES = {UNSEEN: "unseen drawn craft", "peers": "drawn quadcopters, ten flights 
 CRASHED = 65535
 SETTINGS = (
     "hidden=[64,64]", "steps_per_update=16384", "learning_rate=0.004",
-    "critic_learning_rate=0.012",
+    "critic_learning_rate=0.012", "gamma=0.99", "gae_lambda=0.95",
 )  # fmt: skip
 STARTS = {"hover": "rotorgram/Hover-v0", "throws": "rotorgram/Recovery-v0"}
 
@@ -56,16 +56,8 @@ STARTS = {"hover": "rotorgram/Hover-v0", "throws": "rotorgram/Recovery-v0"}
 def trained(seed: int, env_steps: int, folder: Path) -> float:
     """Train; wall time of the process, s."""
     words = ["train", "ppo", "--config", str(CONFIG), "--preset", "robust", "--set", *SETTINGS]
-    words += [
-        "--preset-of",
-        STARTS["hover"],
-        "--num-envs",
-        "512",
-        "--env-steps",
-        str(env_steps),
-        "--seed",
-        str(seed),
-    ]
+    words += ["--preset-of", STARTS["hover"], "--num-envs", "512"]
+    words += ["--env-steps", str(env_steps), "--seed", str(seed)]
     began = time.perf_counter()
     subprocess.run([sys.executable, "-m", "rotorgram.cli", *words, "--out", str(folder)],
                    check=True, stdout=subprocess.DEVNULL)  # fmt: skip

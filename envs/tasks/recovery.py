@@ -5,6 +5,7 @@ from typing import Annotated
 
 import numpy as np
 
+from ...models.drawn import columns
 from ...models.fields import Limits, immutable
 from ...sim import Array, Draw, InitialState, cos, length, sin, square_root, stack
 from ..spec import Metric
@@ -148,13 +149,16 @@ class Recovery(GoalTask):
         level = square_root(1.0 - climb * climb) * speed
         velocity = stack((level * cos(azimuth), level * sin(azimuth), climb * speed))
         rates = draw.uniform(-1.0, 1.0, (3,))
+        spin = self.spin
+        if draw.craft is not None:
+            spin = np.minimum(options.spin, STOP_TIME * columns(draw.craft)["turning"])
         self.memory.missed = 0.0  # time of the last step that was not recovered, s
         self.memory.lowest = options.goal[2]  # m
         return InitialState(
             position=at(options.goal, share),
             quaternion=stack(parts),
             velocity=velocity,
-            body_rates=rates * self.spin,
+            body_rates=rates * spin,
         )
 
     def update_memory(self, state: State) -> None:
