@@ -1,7 +1,7 @@
 """One policy for every craft: how it is trained, and what it flies.
 
     python studies/universal.py [--seeds 5] [--first-seed 900] [--flights 1000]
-        [--env-steps 30000000] [--peers 100] [--only-sums]
+        [--env-steps 16000000] [--peers 100] [--only-sums]
 
 Each seed trains by `rotorgram train ppo --config studies/universal.toml`; the clock runs from
 before the process starts to after it has ended. The policy flies craft that no training saw,
@@ -253,7 +253,7 @@ def _shown(cell: dict[str, Any] | None) -> str:
 
 
 def main() -> None:
-    args = options(__doc__, seeds=5, first_seed=900, flights=1000, env_steps=30_000_000, peers=100,
+    args = options(__doc__, seeds=5, first_seed=900, flights=1000, env_steps=16_000_000, peers=100,
                    only_sums=False).parse_args()  # fmt: skip
     if not args.only_sums:
         measure(args)
