@@ -38,6 +38,7 @@ COURSE_WORST_STEP = -0.05  # Of a course: a hundredth of the cost of a crash
 LEAST_TILT_COSINE = 0.0
 """Cosine of the tilt (90°) past which the craft counts as flipped over."""
 SHIFT = ("goal_x", "goal_y", "goal_z")  # parameters of events that move a goal
+BODY_ACTIONS = ("rotors", "rates")  # Of a course: those with an observation in the body frame
 AIR = 0.6  # Least room under a craft that starts, m
 FURTHEST = 1e4  # Furthest goal, m
 MAX_SPEED = 100.0  # Speed past which an observation is clipped, m/s
@@ -159,18 +160,23 @@ class GoalTask(NumbersTask):
         position = state.position
         quaternion = state.quaternion
         to_place = self.place(state) - position
+        vectors = [self.framed(state, vector) for vector in (to_place, state.velocity)]
         if self.body:
-            vectors = [to_body(quaternion, v) for v in (to_place, state.velocity)]
             vectors.append(world_z(quaternion))
         else:
-            seen = (to_place, state.velocity, body_x(quaternion), body_z(quaternion))
-            vectors = [self.turned(vector) for vector in seen]
+            vectors += [self.turned(axis) for axis in (body_x(quaternion), body_z(quaternion))]
         dtype = state.thrust.dtype
         hover = np.asarray(self.vehicle.hover_thrust, dtype)
         thrust = state.thrust / hover - 1.0
         parts = [*vectors, state.body_rates, thrust, *self.further(state)]
         bounds = [bound.astype(dtype) for bound in self._bounds]
         return {"observation": clip(np.concat(parts, axis=-1), *bounds)}
+
+    def framed(self, state: State, vectors: Array) -> Array:
+        """World vectors in the frame of the observation, shape (W, A, 3)."""
+        if self.body:
+            return to_body(state.quaternion, vectors)
+        return self.turned(vectors)
 
     def further(self, state: State) -> Sequence[Array]:
         """Further vectors, (W, A, k), of the observation, as they were defined."""
