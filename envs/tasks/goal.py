@@ -2,12 +2,12 @@
 
 import math
 from collections.abc import Sequence
-from typing import Annotated, NamedTuple
+from typing import Annotated, Literal, NamedTuple
 
 import numpy as np
 
 from ...models import InputError
-from ...models.fields import Limits
+from ...models.fields import Limits, immutable
 from ...sim import (
     Array,
     Draw,
@@ -25,7 +25,7 @@ from ...sim import (
 )
 from ..spec import ArraySpec, Metric
 from ..state import State
-from .task import Outcome, Task
+from .task import Outcome, Task, TaskOptions
 
 ERROR_SCALE = 0.5  # Distance at which the reward for nearness crosses zero, m
 RATE_WEIGHT = 0.02  # Cost of a body rate of 1 rad/s
@@ -38,7 +38,7 @@ COURSE_WORST_STEP = -0.05  # Of a course: a hundredth of the cost of a crash
 LEAST_TILT_COSINE = 0.0
 """Cosine of the tilt (90°) past which the craft counts as flipped over."""
 SHIFT = ("goal_x", "goal_y", "goal_z")  # parameters of events that move a goal
-BODY_ACTIONS = ("rotors", "rates")  # Of a course: those with an observation in the body frame
+BODY_ACTIONS = ("rotors", "rates")  # Those that act in the body frame
 AIR = 0.6  # Least room under a craft that starts, m
 FURTHEST = 1e4  # Furthest goal, m
 MAX_SPEED = 100.0  # Speed past which an observation is clipped, m/s
@@ -89,6 +89,15 @@ Heading = Annotated[float, Limits(-360.0, 360.0, "degrees")]
 """Of an option: a direction about z, degrees, anticlockwise from x."""
 
 
+@immutable
+class FramedOptions(TaskOptions):
+    """Options of a task with an observation in the body frame or in that of the world."""
+
+    frame: Literal["body", "world"] | None = None
+    """Frame of the observation; by default that in which the action acts: `body` with the actions
+    `rotors` and `rates`, `world` with the others."""
+
+
 class NumbersTask(Task):
     """Base of tasks that observe one row of numbers, which they keep within its bounds."""
 
@@ -129,14 +138,21 @@ class GoalTask(NumbersTask):
     A derived class calls `define_observation` in `setup`, and gives further numbers in `further`.
     It has an option `goal`, or overrides the method.
 
-    With `body` the first two vectors are in the body frame, and the direction of world z in the
-    body frame takes the place of nose and thrust axis: 12 + R numbers that no heading changes.
+    Where the options are `FramedOptions`, the first two vectors may be in the body frame, and the
+    direction of world z in it takes the place of nose and thrust axis: 12 + R numbers that no
+    heading changes.
     """
 
     wanted = 0.0
     """Heading that the frame of the observation is turned by, rad, anticlockwise from x."""
-    body = False
-    """Whether the observation is in the body frame."""
+
+    @property
+    def body(self) -> bool:
+        """Whether the observation is in the body frame."""
+        if not isinstance(self.options, FramedOptions):
+            return False
+        usual = "body" if self.action in BODY_ACTIONS else "world"
+        return (self.options.frame or usual) == "body"
 
     def define_observation(self, band: float, further: Sequence[Number] = ()) -> None:
         """Set `observation`: positions up to twice the band, m, and further numbers after them."""

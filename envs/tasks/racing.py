@@ -33,12 +33,12 @@ from ...sim import (
 from ..spec import Mark, Metric
 from ..state import State
 from .goal import (
-    BODY_ACTIONS,
     COURSE_RATE_WEIGHT,
     COURSE_WORST_STEP,
     FLIGHT_TIME,
     PASSING_REWARD,
     Distance,
+    FramedOptions,
     GoalTask,
     Heading,
     Margin,
@@ -89,7 +89,7 @@ class _Track:
 
 
 @immutable
-class RacingOptions(TaskOptions):
+class RacingOptions(FramedOptions):
     """Options of `rotorgram/Racing-v0`."""
 
     track: str = "oval"
@@ -119,8 +119,8 @@ class Racing(GoalTask):
 
     Those of `GoalTask`, whose goal is the centre of the next gate; then x and y of the direction in
     which it is passed; the centre of the gate after it minus position; x and y of its direction;
-    and half the size of the next gate. With the actions `rotors` and `rates` all are in the body
-    frame, and directions of gates have three numbers.
+    and half the size of the next gate. All are in the `frame`; in that of the body, directions of
+    gates have three numbers.
 
     Numbers are clipped: positions at the size of the track, speeds at 100 m/s, rates at 100 rad/s.
 
@@ -181,7 +181,6 @@ class Racing(GoalTask):
 
     def define_race(self, count: int, reach: float, half: float) -> None:
         """Set `observation`, for gates of half a size and within a reach of each other, m."""
-        self.body = self.action in BODY_ACTIONS
         self._count = count
         self._total = count * self.options.laps
         axes = "xyz" if self.body else "xy"
@@ -283,7 +282,7 @@ class Racing(GoalTask):
 
 
 @immutable
-class GatesOptions(TaskOptions):
+class GatesOptions(FramedOptions):
     """Options of `rotorgram/Gates-v0`."""
 
     opening: Annotated[float, Limits(1.0, 20.0, "m")] = 1.5

@@ -1,7 +1,7 @@
 """`rotorgram/Recovery-v0`: thrown at any attitude and spinning, come to rest where it began."""
 
 import math
-from typing import Annotated, Literal
+from typing import Annotated
 
 import numpy as np
 
@@ -11,6 +11,7 @@ from ..spec import Metric
 from ..state import State
 from .goal import (
     WORST_RATES,
+    FramedOptions,
     GoalTask,
     Point,
     Size,
@@ -22,16 +23,15 @@ from .goal import (
     check_height,
     nearness,
 )
-from .task import Outcome, TaskOptions
+from .task import Outcome
 
 ERROR_SCALE = 1.0  # Distance at which the reward for nearness crosses zero, m
 TILT_WEIGHT = 0.25  # Cost of a tilt of 90°; upside down it is twice as much
 STOP_TIME = 0.5  # Longest time to stop the spin about an axis by all torque about it, s
-Frame = Literal["body", "world"]
 
 
 @immutable
-class RecoveryOptions(TaskOptions):
+class RecoveryOptions(FramedOptions):
     """Options of `rotorgram/Recovery-v0`."""
 
     goal: Point = (0.0, 0.0, 20.0)
@@ -49,9 +49,6 @@ class RecoveryOptions(TaskOptions):
     """... and tilted by less than this, degrees."""
     flight_band: Size = 15.0
     """An episode terminates when the craft is further than this from its goal, m."""
-    frame: Frame | None = None
-    """Frame of the observation; by default that in which the action acts: `body` with the actions
-    `rotors` and `rates`, `world` with the others."""
 
     def check(self) -> None:
         """Check the options of this task. Raises `InputError`."""
@@ -120,8 +117,6 @@ class Recovery(GoalTask):
         check_height("goal", options.goal[2], vehicle.rest_height)
         turning = [min(vehicle.turning(axis), vehicle.turning(-axis)) for axis in np.eye(3)]
         self.spin = np.minimum(options.spin, STOP_TIME * np.array(turning))
-        usual = "body" if self.action in ("rotors", "rates") else "world"
-        self.body = (options.frame or usual) == "body"
         self.define_observation(options.flight_band)
         self._least_upright = cos(math.radians(options.upright))
 

@@ -9,12 +9,12 @@ from ...sim import Array, Draw, InitialState, length
 from ..spec import Mark, Metric
 from ..state import State
 from .goal import (
-    BODY_ACTIONS,
     COURSE_RATE_WEIGHT,
     COURSE_WORST_STEP,
     FLIGHT_TIME,
     FURTHEST,
     PASSING_REWARD,
+    FramedOptions,
     GoalTask,
     Margin,
     Point,
@@ -22,13 +22,13 @@ from .goal import (
     check_height,
     row_of,
 )
-from .task import Outcome, TaskOptions
+from .task import Outcome
 
 MAX_POINTS = 64
 
 
 @immutable
-class WaypointsOptions(TaskOptions):
+class WaypointsOptions(FramedOptions):
     """Options of `rotorgram/Waypoints-v0`."""
 
     points: Annotated[int, Limits(1, MAX_POINTS, whole=True)] = 4
@@ -53,7 +53,7 @@ class Waypoints(GoalTask):
     ## Observation, `float32`, shape (15 + R,) or (18 + R,)
 
     Those of `GoalTask`, whose goal is the next point; then the point after it minus position, of
-    the last point the same. With the actions `rotors` and `rates` all are in the body frame.
+    the last point the same. All are in the `frame`.
 
     Numbers are clipped: positions at the diagonal of the box and its margin, speeds at 100 m/s,
     rates at 100 rad/s.
@@ -98,7 +98,6 @@ class Waypoints(GoalTask):
         self.marks = (Mark(shape="ball", size=options.radius, moves=True),)
         self._sides = tuple(side + options.margin for side in options.box)
         furthest = 2 * length(np.array(self._sides))
-        self.body = self.action in BODY_ACTIONS
         self.define_observation(furthest / 2, along("point after - position", "m", furthest))
 
     def begin(self, draw: Draw) -> InitialState:

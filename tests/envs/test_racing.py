@@ -52,6 +52,8 @@ def test_observation_by_hand(action: str, expected: list[float]) -> None:
     _, high = spec.bounds()
     assert high[0] == pytest.approx(math.hypot(2, 3) + 10.0)
     assert task.goal(state).tolist() == [2.0, 0.0, 5.0]
+    frame, other = ("body", "attitude") if action == "rotors" else ("world", "rotors")
+    assert observed(begun(action=other, frame=frame), state).tolist() == seen.tolist()
 
 
 @rows_of("what is a pass", "before, after, passes")

@@ -49,6 +49,9 @@ def test_observation_by_hand(action: str, expected: list[float]) -> None:
     state = state_of(position=(1.0, -1.0, 4.0), velocity=(1.0, 2.0, 3.0), quaternion=[0.5] * 4)
     seen = observed(task, state)
     assert seen == pytest.approx(expected, abs=1e-12)
+    frame, other = ("body", "attitude") if action == "rotors" else ("world", "rotors")
+    same = begun(MIDDLE, EAST, ABOVE, action=other, frame=frame)
+    assert observed(same, state).tolist() == seen.tolist()
     (spec,) = task.observation
     assert spec.components[:3] == GOAL_OFFSET
     assert spec.components[-1] == "point after - position z"
