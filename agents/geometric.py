@@ -17,7 +17,8 @@ OVER = 2.5  # Gain of the velocity loop over the position loop's: `sim/control/g
 JUMP = 4.0  # Speed of a goal, over the craft's largest, from which on it has jumped
 _ACTION = ("offset x", "offset y", "offset z", "offset of the heading")
 _PAYLOAD = ("payload - position", "payload velocity - velocity")
-_VECTORS = ("goal - position", "velocity", "thrust axis", "nose")
+_VECTORS = ("goal - position", "velocity")
+_AXES = ("thrust axis", "nose")
 
 
 class Geometric:
@@ -25,7 +26,8 @@ class Geometric:
 
     The simulator flies: the env's action is that of the level `position`. The observation has to
     have components named goal - position, velocity, nose and thrust axis x, y and z, and thrust 1,
-    2... over hover, world frame turned by the wanted heading. Goal and velocity give the velocity
+    2... over hover, world frame turned by the wanted heading. In the body frame it has up in place
+    of nose and thrust axis, and the heading is held as it is. Goal and velocity give the velocity
     and acceleration of the goal; thrust and velocity give the acceleration that wind or a payload
     causes. Each is filtered, and stands for the offset at which the loops ask for it.
 
@@ -50,7 +52,8 @@ class Geometric:
         self._gravity = spec.constant("gravity", "geometric")
         self._scale = spec.action_scale
         seen = [name for array in spec.observation for name in component_names(array)]
-        self._at = spec.vectors("geometric", _VECTORS, _PAYLOAD)
+        needed = _VECTORS if "up x" in seen else (*_VECTORS, *_AXES)
+        self._at = spec.vectors("geometric", needed, (*_PAYLOAD, "up"))
         self._rotors = [i for i, name in enumerate(seen) if name.endswith(" over hover")]
         self._swing: Array | None = None
         self._pull = 0.0  # of the payload on the craft, m/s² per m that it hangs aside
@@ -74,7 +77,7 @@ class Geometric:
         """Offset and heading as the env's action, float32, shape (4,)."""
         lead = lead_of(observation, self._spec)
         numbers = flat(observation, self._spec, *lead).astype(np.float64)
-        now = {name: numbers[..., at] for name, at in self._at.items()}
+        now = leveled({name: numbers[..., at] for name, at in self._at.items()})
         over_hover = numbers[..., self._rotors].mean(axis=-1) if self._rotors else 0.0
         lift = np.asarray(self._gravity * (1.0 + over_hover))[..., None]
         now["force"] = lift * now["thrust axis"] - (0.0, 0.0, self._gravity)
@@ -116,6 +119,25 @@ class Geometric:
         change: Array = np.where(jumped, 0.0, self._share * (moving - self._moving))
         self._moving = np.where(jumped, 0.0, self._moving + change)
         return change / period
+
+
+def leveled(vectors: ByName) -> ByName:
+    """Vectors by name, (..., 3), with nose and thrust axis, in a frame whose z is up.
+
+    Those with `up` among them are of the body frame: the level one has the nose at the heading 0.
+    """
+    if "up" not in vectors:
+        return vectors
+    up = vectors["up"]
+    ahead = (1.0, 1e-9, 0.0) - up[..., :1] * up  # never 0
+    axes = triad(ahead / np.linalg.norm(ahead, axis=-1, keepdims=True), up)
+    turned = {name: (axes @ one[..., np.newaxis])[..., 0] for name, one in vectors.items()}
+    return turned | {"nose": axes[..., 0], "thrust axis": axes[..., 2]}
+
+
+def triad(x: Array, z: Array) -> Array:
+    """Rows x, y and z of right angles, (..., 3, 3), from x and z, (..., 3)."""
+    return np.stack((x, np.cross(z, x), z), axis=-2)
 
 
 def level_action(vector: Array, c: Array, s: Array, turn: Array, scale: Array) -> Floats:

@@ -7,6 +7,7 @@ import numpy as np
 
 from ..envs.spec import EnvSpec
 from ..models.errors import InputError, require
+from .geometric import leveled, triad
 from .layers import Floats
 from .policies import Array, Observation, flat, lead_of
 
@@ -73,6 +74,8 @@ class Raptor:
         lead = lead_of(observation, self._spec)
         numbers = flat(observation, self._spec, *(lead or (1,))).astype(np.float64)
         now = {name: numbers[:, at] for name, at in self._at.items()}
+        rates = now.pop("body rate")
+        now = leveled(now)
         goal = now["goal - position"]
         velocity = now["velocity"] - now.get("reference velocity", 0.0)
         if _GATE in now:
@@ -82,19 +85,13 @@ class Raptor:
             goal[:, 2] -= BEYOND
             velocity[:, :2] -= now[_PAD]
         vectors = np.stack((-goal, velocity), axis=1)
-        if "up" in now:
-            up = now["up"]
-            level = (1.0, 1e-9, 0.0) - up[:, :1] * up  # never 0
-            axes = triad(level / np.linalg.norm(level, axis=1, keepdims=True), up)
-            vectors = vectors @ axes.swapaxes(1, 2)
-        else:
-            axes = triad(now["nose"], now["thrust axis"]).swapaxes(1, 2)
+        axes = triad(now["nose"], now["thrust axis"]).swapaxes(1, 2)
         frame = self._frame
         vectors /= np.maximum(np.linalg.norm(vectors, axis=2, keepdims=True) / LIMITS, 1.0)
         position, velocity = (vectors @ frame).swapaxes(0, 1)
         attitude = (frame.T @ axes @ frame).reshape(-1, 9)
         last = np.broadcast_to(self._last, (len(numbers), 4))
-        inputs = (position, attitude, velocity, now["body rate"] @ frame, last)
+        inputs = (position, attitude, velocity, rates @ frame, last)
         motors = self._policy.evaluate_step(np.concatenate(inputs, axis=1))
         self._last = np.clip(motors, -1.0, 1.0)
         throttles = 0.5 + 0.5 * self._last[:, self._motors]
@@ -102,11 +99,6 @@ class Raptor:
         pairs = zip(thrusts.T, self._thrusts, strict=True)
         actions = [np.interp(thrust, levels, (-1.0, 0.0, 1.0)) for thrust, levels in pairs]
         return np.array(actions, np.float32).T.reshape(*lead, 4)
-
-
-def triad(x: Array, z: Array) -> Array:
-    """Rows x, y and z of right angles, (..., 3, 3), from x and z, (..., 3)."""
-    return np.stack((x, np.cross(z, x), z), axis=-2)
 
 
 def layout(roll: Array, pitch: Array, yaw: Array) -> tuple[Any, Any]:

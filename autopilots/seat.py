@@ -230,14 +230,16 @@ class Seat:
 
 def seated(config: EnvConfig, rate: float) -> EnvConfig:
     """The config of a flight from a seat: rotors at the program's rate, in Hz, the same time in an
-    episode, and sensors without errors but for those that are given.
+    episode, sensors without errors but for those that are given, and the frame of the world.
     """
     assert config.control_period is not None
     assert config.episode_length is not None
     seconds = config.control_period * config.episode_length
+    frame = {"frame": "world"} if config.task.get("frame", "") is None else {}
     return config.changed(
         action="rotors",
         control_period=1.0 / rate,
         episode_length=round(seconds * rate),
         sensors=exact(config.sensors),
+        **frame,
     )

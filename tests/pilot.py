@@ -57,19 +57,46 @@ class Pilot:
 
 
 def fly(
-    env: Any, pilot: Pilot, wanted: Callable[[np.ndarray], np.ndarray], seed: int = 0
+    env: Any,
+    pilot: Pilot,
+    wanted: Callable[[np.ndarray], np.ndarray],
+    seed: int = 0,
+    of_body: tuple[int, ...] | None = None,
 ) -> np.ndarray:
     """Metrics after each step, (steps, N, metrics): until all have ended, and who has ended rests.
 
-    `wanted` gives accelerations from observations.
+    `wanted` gives accelerations from observations. Where these are in the body frame, `of_body`
+    names their further vectors, and both see what `leveled` makes of them.
     """
     env.reset(seed=seed)
     metrics = []
     while not env.done.all():
-        actions = pilot.act(env.observations, wanted(env.observations.astype(np.float64)))
+        seen = env.observations.astype(np.float64)
+        if of_body is not None:
+            seen = leveled(seen, of_body)
+        actions = pilot.act(seen, wanted(seen))
         env.advance(actions, None, None, env.done)
         metrics.append(env.telemetry["metrics"].copy())
     return np.array(metrics)
+
+
+def leveled(seen: np.ndarray, further: tuple[int, ...]) -> np.ndarray:
+    """Observations in the body frame, (N, 12 + R or more), as those of a level frame that turns
+    with the craft, (N, 15 + R or more).
+
+    `further` are the columns at which vectors after the thrusts begin.
+    """
+    up = seen[:, 6:9]
+    nose, axis = np.broadcast_to(np.eye(3)[[0, 2], np.newaxis], (2, *up.shape))
+    forward = nose - up * up[:, :1]
+    forward /= np.linalg.norm(forward, axis=1, keepdims=True)
+    to_level = np.stack((forward, np.cross(up, forward), up), axis=1)
+    seen = seen.copy()
+    for first in (0, 3, *further):
+        vectors = seen[:, first : first + 3]
+        vectors[...] = np.einsum("nij,nj->ni", to_level, vectors)
+    axes = np.einsum("nij,knj->kni", to_level, np.stack((nose, axis)))
+    return np.hstack((seen[:, :6], *axes, seen[:, 9:]))
 
 
 def limited(vectors: np.ndarray, most: float) -> np.ndarray:

@@ -7,7 +7,7 @@ from typing import Annotated, Literal, NamedTuple
 import numpy as np
 
 from ...models import InputError
-from ...models.fields import Limits
+from ...models.fields import Limits, immutable
 from ...sim import (
     SEEN,
     Array,
@@ -29,7 +29,7 @@ from ...sim import (
 )
 from ..spec import ArraySpec, Metric
 from ..state import State
-from .task import Outcome, Task
+from .task import Outcome, Task, TaskOptions
 
 ERROR_SCALE = 0.5  # Distance at which the reward for nearness crosses zero, m
 HEADING_WEIGHT = 0.2  # Cost of a heading half a turn off
@@ -43,6 +43,7 @@ COURSE_WORST_STEP = -0.05  # Of a course: a hundredth of the cost of a crash
 LEAST_TILT_COSINE = 0.0
 """Cosine of the tilt (90°) past which the craft counts as flipped over."""
 SHIFT = ("goal_x", "goal_y", "goal_z")  # parameters of events that move a goal
+BODY_ACTIONS = ("rotors", "rates")  # Those that act in the body frame
 AIR = 0.6  # Least room under a craft that starts, m
 FURTHEST = 1e4  # Furthest goal, m
 MAX_SPEED = 100.0  # Speed past which an observation is clipped, m/s
@@ -96,6 +97,15 @@ Heading = Annotated[float, Limits(-360.0, 360.0, "degrees")]
 """Of an option: a direction about z, degrees, anticlockwise from x."""
 
 
+@immutable
+class FramedOptions(TaskOptions):
+    """Options of a task with an observation in the body frame or in that of the world."""
+
+    frame: Frame | None = None
+    """Frame of the observation; by default that in which the action acts: `body` with the actions
+    `rotors` and `rates`, `world` with the others."""
+
+
 class NumbersTask(Task):
     """Base of tasks that observe one row of numbers, which they keep within its bounds."""
 
@@ -137,9 +147,10 @@ class GoalTask(NumbersTask):
     A derived class calls `define_observation` in `setup`, and gives further numbers in `further`.
     It has an option `goal`, or overrides the method.
 
-    With `body` the first two vectors are in the body frame, and the direction of world z in the
-    body frame takes the place of nose and thrust axis: 12 + R numbers that no heading changes. In
-    a task that `heads` somewhere three more follow it, the wanted direction of the nose.
+    Where the options are `FramedOptions`, the first two vectors may be in the body frame, and the
+    direction of world z in it takes the place of nose and thrust axis: 12 + R numbers that no
+    heading changes. In a task that `heads` somewhere three more follow it, the wanted direction of
+    the nose.
     """
 
     heads = False
@@ -147,8 +158,14 @@ class GoalTask(NumbersTask):
 
     wanted = 0.0
     """Heading that the frame of the observation is turned by, rad, anticlockwise from x."""
-    body = False
-    """Whether the observation is in the body frame."""
+
+    @property
+    def body(self) -> bool:
+        """Whether the observation is in the body frame."""
+        if not isinstance(self.options, FramedOptions):
+            return False
+        usual = "body" if self.action in BODY_ACTIONS else "world"
+        return (self.options.frame or usual) == "body"
 
     def define_observation(self, band: float, further: Sequence[Number] = ()) -> None:
         """Set `observation`: positions up to twice the band, m, and further numbers after them."""
@@ -186,15 +203,14 @@ class GoalTask(NumbersTask):
         position = state.position
         quaternion = state.quaternion
         to_place = self.place(state) - position
+        vectors = [self.framed(state, vector) for vector in (to_place, state.velocity)]
         if self.body:
-            vectors = [to_body(quaternion, v) for v in (to_place, state.velocity)]
             vectors.append(world_z(quaternion))
             if self.heads:
                 ahead = at((cos(self.wanted), sin(self.wanted), 0.0), position[..., 0])
                 vectors.append(to_body(quaternion, ahead))
         else:
-            seen = (to_place, state.velocity, body_x(quaternion), body_z(quaternion))
-            vectors = [self.turned(vector) for vector in seen]
+            vectors += [self.turned(axis) for axis in (body_x(quaternion), body_z(quaternion))]
         dtype = state.thrust.dtype
         if isinstance(self.controller, Wrench):
             thrust = stack(self.controller.seen(state)).astype(dtype)
@@ -203,6 +219,12 @@ class GoalTask(NumbersTask):
         parts = [*vectors, state.body_rates, thrust, *self.further(state)]
         bounds = [bound.astype(dtype) for bound in self._bounds]
         return {"observation": clip(np.concat(parts, axis=-1), *bounds)}
+
+    def framed(self, state: State, vectors: Array) -> Array:
+        """World vectors in the frame of the observation, shape (W, A, 3)."""
+        if self.body:
+            return to_body(state.quaternion, vectors)
+        return self.turned(vectors)
 
     def further(self, state: State) -> Sequence[Array]:
         """Further vectors, (W, A, k), of the observation, as they were defined."""

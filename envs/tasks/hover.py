@@ -20,6 +20,7 @@ from .goal import (
     WORST_RATES,
     Distance,
     Frame,
+    FramedOptions,
     GoalTask,
     Heading,
     Point,
@@ -31,14 +32,14 @@ from .goal import (
     nearness,
 )
 from .measures import METRICS, begin_measures, measures_of, update_measures
-from .task import Outcome, TaskOptions
+from .task import Outcome
 
 _LIDAR = {"model": "os0", "rows": 10, "columns": 48, "low": -30.0, "high": 45.0}
 _NEAR = 0.5  # cost of a step that touches; e times less each 0.5 m further off
 
 
 @immutable
-class HoverOptions(TaskOptions):
+class HoverOptions(FramedOptions):
     """Options of `rotorgram/Hover-v0`."""
 
     goal: Point = (0.0, 0.0, 5.0)
@@ -53,8 +54,8 @@ class HoverOptions(TaskOptions):
     """Largest error of the heading at the start, degrees."""
     flight_band: Distance = 3.0
     """An episode terminates when the craft is further than this from its goal, m."""
-    frame: Frame = "world"
-    """Frame of the observation, see `GoalTask`."""
+    frame: Frame | None = "world"
+    """Frame of the observation."""
 
     def check(self) -> None:
         """Check the options of this task. Raises `InputError`."""
@@ -105,7 +106,6 @@ class Hover(GoalTask):
         options = self.options
         check_height("goal", options.goal[2], self.vehicle.rest_height + options.start_band)
         self.wanted = math.radians(options.heading)
-        self.body = options.frame == "body"
         self.define_observation(options.flight_band)
 
     def begin(self, draw: Draw) -> InitialState:

@@ -28,7 +28,6 @@ from ...sim import (
     sin,
     square_root,
     stack,
-    to_body,
     total,
 )
 from ..spec import Mark, Metric
@@ -39,6 +38,7 @@ from .goal import (
     FLIGHT_TIME,
     PASSING_REWARD,
     Distance,
+    FramedOptions,
     GoalTask,
     Heading,
     Margin,
@@ -89,7 +89,7 @@ class _Track:
 
 
 @immutable
-class RacingOptions(TaskOptions):
+class RacingOptions(FramedOptions):
     """Options of `rotorgram/Racing-v0`."""
 
     track: str = "oval"
@@ -115,11 +115,12 @@ class Racing(GoalTask):
 
     Gates are not solid: they are lines in the air, and a craft that misses one has to come back.
 
-    ## Observation, `float32`, shape (23 + R,)
+    ## Observation, `float32`, shape (22 + R,) or (23 + R,)
 
     Those of `GoalTask`, whose goal is the centre of the next gate; then x and y of the direction in
     which it is passed; the centre of the gate after it minus position; x and y of its direction;
-    and half the size of the next gate.
+    and half the size of the next gate. All are in the `frame`; in that of the body, directions of
+    gates have three numbers.
 
     Numbers are clipped: positions at the size of the track, speeds at 100 m/s, rates at 100 rad/s.
 
@@ -149,7 +150,7 @@ class Racing(GoalTask):
     hover thrust.
 
     *Terminated*: the last gate is passed; further than 5 m from the line between the last gate and
-    the next (`margin`), a tilt above 90°, or contact. *Truncated*: after 1500 steps of 0.02 s.
+    the next (`margin`), or contact. Any tilt is allowed. *Truncated*: after 1500 steps of 0.02 s.
     """
 
     Options: ClassVar[type[TaskOptions]] = RacingOptions
@@ -258,14 +259,14 @@ class Racing(GoalTask):
         if self.body:
             level = 0.0 * way[..., :1]
             vectors = [np.concat((vector, level), axis=-1)[..., :3] for vector in vectors]
-            vectors = [to_body(state.quaternion, vector) for vector in vectors]
+            vectors = [self.framed(state, vector) for vector in vectors]
         return *vectors, gate[..., 5:]
 
     def outcome(self, state: State) -> Outcome:
         """Progress to the next gate; the end at the last one, or off the track."""
         memory = self.memory
         left = self._total - memory.passed
-        crashed = self.crashed(state, memory.off > self.options.margin)
+        crashed = (memory.off > self.options.margin) | state.touching
         terms = {"progress": memory.progress, "passing": PASSING_REWARD * memory.passing}
         metrics = {"gates_left": left, "flight_time": state.time, "lap_time": memory.lap}
         return self.judged(state, terms, crashed, metrics, left < 0.5, COURSE_RATE_WEIGHT)
@@ -281,7 +282,7 @@ class Racing(GoalTask):
 
 
 @immutable
-class GatesOptions(TaskOptions):
+class GatesOptions(FramedOptions):
     """Options of `rotorgram/Gates-v0`."""
 
     opening: Annotated[float, Limits(1.0, 20.0, "m")] = 1.5
@@ -302,9 +303,7 @@ class Gates(Racing):
 
     ## Observation, `float32`, shape (22 + R,) or (23 + R,)
 
-    With the actions `rotors` and `rates` all numbers of `Racing-v0` in the body frame: one setting
-    serves every heading. The direction of world z takes the place of nose and thrust axis, and the
-    directions of gates have three numbers. With other actions, those of `Racing-v0`.
+    Those of `Racing-v0`.
 
     ## Action
 
@@ -323,7 +322,7 @@ class Gates(Racing):
     At rest before the first gate, the nose towards it, within 0.1 m along each axis (`start_band`).
 
     *Terminated*: the last gate is passed; further than 3 m from the line between the last gate and
-    the next (`margin`), a tilt above 90°, or contact. *Truncated*: after 1500 steps of 0.02 s.
+    the next (`margin`), or contact. Any tilt is allowed. *Truncated*: after 1500 steps of 0.02 s.
     """
 
     Options = GatesOptions
@@ -348,7 +347,6 @@ class Gates(Racing):
                 f"opening: expected gates wider than the craft, {2 * self.vehicle.radius:.3g} m, "
                 f"got {2 * half:g} m"
             )
-        self.body = self.action in ("rotors", "rates")
         reach = 2 * scale * _RING + 2 * self.options.margin
         self.define_race(_COUNT, reach, half)
 

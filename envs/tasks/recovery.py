@@ -12,7 +12,7 @@ from ..spec import Metric
 from ..state import State
 from .goal import (
     WORST_RATES,
-    Frame,
+    FramedOptions,
     GoalTask,
     Heading,
     Point,
@@ -26,7 +26,7 @@ from .goal import (
     heading_cost,
     nearness,
 )
-from .task import Outcome, TaskOptions
+from .task import Outcome
 
 ERROR_SCALE = 1.0  # Distance at which the reward for nearness crosses zero, m
 TILT_WEIGHT = 0.25  # Cost of a tilt of 90°; upside down it is twice as much
@@ -34,7 +34,7 @@ STOP_TIME = 0.5  # Longest time to stop the spin about an axis by all torque abo
 
 
 @immutable
-class RecoveryOptions(TaskOptions):
+class RecoveryOptions(FramedOptions):
     """Options of `rotorgram/Recovery-v0`."""
 
     goal: Point = (0.0, 0.0, 20.0)
@@ -54,9 +54,6 @@ class RecoveryOptions(TaskOptions):
     """An episode terminates when the craft is further than this from its goal, m."""
     heading: Heading | None = None
     """Direction of the nose to come to rest in, degrees about z; none: any will do."""
-    frame: Frame | None = None
-    """Frame of the observation; by default that in which the action acts: `body` with the actions
-    `rotors` and `rates`, `world` with the others."""
 
     def check(self) -> None:
         """Check the options of this task. Raises `InputError`."""
@@ -126,8 +123,6 @@ class Recovery(GoalTask):
         check_height("goal", options.goal[2], vehicle.rest_height)
         turning = [min(vehicle.turning(axis), vehicle.turning(-axis)) for axis in np.eye(3)]
         self.spin = np.minimum(options.spin, STOP_TIME * np.array(turning))
-        usual = "body" if self.action in ("rotors", "rates") else "world"
-        self.body = (options.frame or usual) == "body"
         self.heads = options.heading is not None
         self.wanted = math.radians(options.heading or 0.0)
         self.define_observation(options.flight_band)

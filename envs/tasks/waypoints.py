@@ -14,6 +14,7 @@ from .goal import (
     FLIGHT_TIME,
     FURTHEST,
     PASSING_REWARD,
+    FramedOptions,
     GoalTask,
     Margin,
     Point,
@@ -21,13 +22,13 @@ from .goal import (
     check_height,
     row_of,
 )
-from .task import Outcome, TaskOptions
+from .task import Outcome
 
 MAX_POINTS = 64
 
 
 @immutable
-class WaypointsOptions(TaskOptions):
+class WaypointsOptions(FramedOptions):
     """Options of `rotorgram/Waypoints-v0`."""
 
     points: Annotated[int, Limits(1, MAX_POINTS, whole=True)] = 4
@@ -49,10 +50,10 @@ class WaypointsOptions(TaskOptions):
 class Waypoints(GoalTask):
     """Reach points one after the other, as soon as possible; with the last the episode ends.
 
-    ## Observation, `float32`, shape (18 + R,)
+    ## Observation, `float32`, shape (15 + R,) or (18 + R,)
 
     Those of `GoalTask`, whose goal is the next point; then the point after it minus position, of
-    the last point the same.
+    the last point the same. All are in the `frame`.
 
     Numbers are clipped: positions at the diagonal of the box and its margin, speeds at 100 m/s,
     rates at 100 rad/s.
@@ -78,8 +79,8 @@ class Waypoints(GoalTask):
 
     At rest and level, at hover thrust, at a point of the box.
 
-    *Terminated*: the last point is reached; further than 3 m outside the box (`margin`), a tilt
-    above 90°, or contact. *Truncated*: after 750 steps of 0.02 s.
+    *Terminated*: the last point is reached; further than 3 m outside the box (`margin`), or
+    contact. Any tilt is allowed. *Truncated*: after 750 steps of 0.02 s.
     """
 
     Options = WaypointsOptions
@@ -126,7 +127,8 @@ class Waypoints(GoalTask):
 
     def further(self, state: State) -> tuple[Array]:
         """The way to the point after the next."""
-        return (self._point(self.memory.reached + 1.0) - state.position,)
+        after = self._point(self.memory.reached + 1.0)
+        return (self.framed(state, after - state.position),)
 
     def outcome(self, state: State) -> Outcome:
         """Progress to the next point; the end at the last one, or far away."""
@@ -134,7 +136,7 @@ class Waypoints(GoalTask):
         memory = self.memory
         left = options.points - memory.reached
         off = abs(state.position - np.array(options.center))
-        crashed = self.crashed(state, (off > self._sides).any(axis=-1))
+        crashed = (off > self._sides).any(axis=-1) | state.touching
         terms = {"progress": memory.progress, "passing": PASSING_REWARD * memory.passed}
         metrics = {"points_left": left, "flight_time": state.time}
         return self.judged(state, terms, crashed, metrics, left < 0.5, COURSE_RATE_WEIGHT)

@@ -60,6 +60,25 @@ def test_every_vehicle_goes_to_the_goal_and_the_heading(file: Path) -> None:
     assert headings[-1] < headings[0] / 4
 
 
+@pytest.mark.parametrize("frame", ["world", "body"])
+@pytest.mark.parametrize("name", ["Waypoints-v0", "Racing-v0"])
+def test_courses_are_flown_in_both_frames(name: str, frame: str) -> None:
+    env = gym.make(f"rotorgram/{name}", action="position", frame=frame)
+    pilot = Geometric(env.get_wrapper_attr("env_spec"))
+    observation, _ = env.reset(seed=0)
+    terminated = False
+    while not terminated:
+        observation, _, terminated, truncated, info = env.step(pilot.act(observation))
+        assert not truncated
+    assert info["points_left" if name == "Waypoints-v0" else "gates_left"] == 0.0
+    assert info["flight_time"] < 17.0
+
+
+def test_a_thrown_craft_comes_back_in_the_body_frame() -> None:
+    env = gym.make("rotorgram/Recovery-v0", action="position", frame="body")
+    assert max(distances(env)[300:]) < 0.1
+
+
 def test_a_goal_that_moves_is_followed() -> None:
     """Without the goal's velocity and acceleration it would stay 1 / 0.88 m behind."""
     errors = distances(gym.make(MOVING, action="position", episode_length=400))

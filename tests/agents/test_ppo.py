@@ -70,7 +70,11 @@ def test_the_tuned_preset_depends_on_the_task() -> None:
     racing = find_preset("ppo", "tuned", "rotorgram/Racing-v0")
     assert racing.num_envs == 512
     assert racing.backend == "rigid"
-    assert racing.config.hidden == (48, 48)
+    assert racing.config.hidden == (64, 64)
+    assert racing.config.log_std == -0.8
+    waypoints = find_preset("ppo", "tuned", "rotorgram/Waypoints-v0").config
+    own = {"log_std": -0.8, "epochs": 2, "minibatches": 32}
+    assert replace(waypoints, **own) == racing.config
     other = find_preset("ppo", "tuned", "other/Task-v0")
     assert other == replace(ours, fits=False, backend=None)  # it may need contact
     swarm = find_preset("ippo", "tuned", "rotorgram/Formation-v0")

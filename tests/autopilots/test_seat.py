@@ -10,6 +10,7 @@ from rotorgram.autopilots import find_stack
 from rotorgram.autopilots.reading import Propellers, exact
 from rotorgram.autopilots.seat import LONGEST_STAND, Seat, Start, seated
 from rotorgram.envs.config import EnvConfig
+from rotorgram.envs.registry import env_spec
 from rotorgram.envs.vector import LocalVectorEnv
 from rotorgram.flights.trajectories import fly_episodes
 from rotorgram.models import InputError
@@ -203,6 +204,20 @@ def test_a_mode_of_another_stack_is_refused():
         find_stack("px4").make(start)
 
 
-def test_a_task_without_a_goal_is_refused():
-    with pytest.raises(InputError, match="the observation 'nose x', got rotorgram/Recovery-v0"):
-        flown([], "rotorgram/Recovery-v0")
+@pytest.mark.parametrize("name", ["Waypoints", "Racing", "Gates", "Recovery"])
+def test_tasks_in_the_body_frame_are_flown_in_that_of_the_world(name):
+    made = []
+    (flight,), _ = flown(made, f"rotorgram/{name}-v0", steps=5)
+    orders = [order.goal for _, order in made[0].seen[-len(flight) :]]
+    assert np.ptp(orders, axis=0) == pytest.approx([0.0, 0.0, 0.0], abs=1e-4)
+    if name in ("Racing", "Recovery"):
+        goal = {"Racing": (6.0, 0.0, 5.0), "Recovery": (0.0, 0.0, 20.0)}[name]
+        assert orders[0] == pytest.approx(goal, abs=1e-4)
+
+
+def test_the_body_frame_is_refused():
+    config = EnvConfig.from_keywords("rotorgram/Waypoints-v0", frame="body")
+    flight = seated(config, RATE)
+    start = Start(flight, flight.load_vehicle(), "hover", None)
+    with pytest.raises(InputError, match="the observation 'nose x', got rotorgram/Waypoints-v0"):
+        Seat(env_spec(flight), start, Hovering)

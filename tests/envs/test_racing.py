@@ -40,17 +40,20 @@ def test_a_start_by_hand() -> None:
     assert pose.quaternion == pytest.approx([root, 0.0, 0.0, root])
 
 
-def test_observation_by_hand() -> None:
-    task = begun()
-    state = state_of(position=(1.0, 0.5, 4.0), velocity=(1.0, 2.0, 3.0))
+@rows_of("racing: observation by hand", "action, expected")
+def test_observation_by_hand(action: str, expected: list[float]) -> None:
+    """Body x is along y of the world, body y along z, body z along x."""
+    task = begun(action=action)
+    state = state_of(position=(1.0, 0.5, 4.0), velocity=(1.0, 2.0, 3.0), quaternion=[0.5] * 4)
     seen = observed(task, state)
-    expected = TABLES["racing: observation by hand, expected"]
     assert seen == pytest.approx(expected, abs=1e-12)
     (spec,) = task.observation
     assert spec.components[:3] == GOAL_OFFSET
     _, high = spec.bounds()
     assert high[0] == pytest.approx(math.hypot(2, 3) + 10.0)
     assert task.goal(state).tolist() == [2.0, 0.0, 5.0]
+    frame, other = ("body", "attitude") if action == "rotors" else ("world", "rotors")
+    assert observed(begun(action=other, frame=frame), state).tolist() == seen.tolist()
 
 
 @rows_of("what is a pass", "before, after, passes")
@@ -126,7 +129,7 @@ def test_a_pilot_flies_it(track: str, name: str | None) -> None:
 
     def wanted(seen: np.ndarray) -> np.ndarray:
         """To a point before the gate, until the craft is on the line through its middle."""
-        way = np.column_stack((seen[:, first : first + 2], np.zeros(4)))
+        way = seen[:, first : first + 3]
         away = seen[:, :3]
         before = np.sum(away * way, axis=1, keepdims=True)  # how far it is ahead
         aside = away - before * way
@@ -134,7 +137,7 @@ def test_a_pilot_flies_it(track: str, name: str | None) -> None:
         target = away + np.where(on_line & (before > -1.0), 1.0, -2.0) * way
         return 2.0 * (limited(1.5 * target, 2.0) - seen[:, 3:6])
 
-    metrics = fly(env, Pilot(vehicle), wanted, 3)
+    metrics = fly(env, Pilot(vehicle), wanted, 3, (first - 3,))
     left, time, lap = metrics[-1].T
     assert left.tolist() == [0.0] * 4
     assert (lap == time).all()

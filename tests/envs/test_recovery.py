@@ -141,15 +141,17 @@ def test_observation_in_the_body_frame_by_hand() -> None:
     assert spec.frame == "body"
 
 
+@pytest.mark.parametrize("name", ["Recovery", "Waypoints", "Racing", "Gates"])
 @rows_of("the frame is by default that of the action", "action, frame")
-def test_the_frame_is_by_default_that_of_the_action(action: str, frame: str) -> None:
-    assert task_of(ID, action=action).body == (frame == "body")
-    task = task_of(ID, action=action, frame="world")
-    assert not task.body
+def test_the_frame_is_by_default_that_of_the_action(action: str, frame: str, name: str) -> None:
+    env_id = f"rotorgram/{name}-v0"
+    assert task_of(env_id, action=action).body == (frame == "body")
+    for chosen in ("body", "world"):
+        assert task_of(env_id, action=action, frame=chosen).body == (chosen == "body")
     with pytest.raises(
         InputError, match=r"^frame: expected 'body' or 'world', or none, got 'nose'"
     ):
-        spec_with(ID, frame="nose")
+        spec_with(env_id, frame="nose")
 
 
 PLACE = {"position": (0.0, 0.0, 20.0)}

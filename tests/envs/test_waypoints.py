@@ -6,7 +6,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
-from contracts import GOAL_OFFSET, TABLES, observed, rows_of
+from contracts import GOAL_OFFSET, observed, rows_of
 from pilot import Pilot, fly, limited
 from rotorgram.models import Vehicle
 
@@ -41,12 +41,17 @@ def test_starts_and_points_by_hand() -> None:
     assert task.goal(state_of()).tolist() == [3.0, 2.0, 6.0]
 
 
-def test_observation_by_hand() -> None:
-    task = begun(MIDDLE, EAST, ABOVE)  # at (0, 0, 5), to (3, 0, 5) and (3, 0, 6.5)
-    state = state_of(position=(1.0, -1.0, 4.0), velocity=(1.0, 2.0, 3.0))
+@rows_of("waypoints: observation by hand", "action, expected")
+def test_observation_by_hand(action: str, expected: list[float]) -> None:
+    """Body x is along y of the world, body y along z, body z along x."""
+    # At (0, 0, 5), to (3, 0, 5) and (3, 0, 6.5).
+    task = begun(MIDDLE, EAST, ABOVE, action=action)
+    state = state_of(position=(1.0, -1.0, 4.0), velocity=(1.0, 2.0, 3.0), quaternion=[0.5] * 4)
     seen = observed(task, state)
-    expected = TABLES["waypoints: observation by hand, expected"]
-    assert seen == pytest.approx(expected)
+    assert seen == pytest.approx(expected, abs=1e-12)
+    frame, other = ("body", "attitude") if action == "rotors" else ("world", "rotors")
+    same = begun(MIDDLE, EAST, ABOVE, action=other, frame=frame)
+    assert observed(same, state).tolist() == seen.tolist()
     (spec,) = task.observation
     assert spec.components[:3] == GOAL_OFFSET
     assert spec.components[-1] == "point after - position z"
@@ -101,7 +106,7 @@ def test_a_pilot_flies_it(name: str | None) -> None:
         speed = limited(2 * seen[:, :3], 2.0)
         return 2 * (speed - seen[:, 3:6])
 
-    metrics = fly(env, pilot, wanted, 3)
+    metrics = fly(env, pilot, wanted, 3, ())
     left, time = metrics[-1].T
     assert left.tolist() == [0.0] * 8
     assert time.max() < 15.0

@@ -1,0 +1,76 @@
+"""The least time of a course: flights whose least time has a closed form."""
+
+import math
+
+import numpy as np
+import pytest
+from bounds import course_time
+
+pytest.importorskip("casadi")
+
+from racing import least_time
+
+LIFT, GRAVITY = 20.0, 9.8
+LEVEL = math.sqrt(LIFT**2 - GRAVITY**2)  # largest acceleration at one height
+START = np.array((1.0, 2.0, 5.0))
+SMALL = 1e-3
+
+
+def gate(ahead: float, aside: float, direction: float = 1.0) -> tuple[float, ...]:
+    """A gate of 1 m so far from the start, which is passed along x or against it."""
+    x, y, z = START
+    return x + ahead, y + aside, z, direction, 0.0, 0.5
+
+
+def through_points(*ways: tuple[float, float, float]) -> float:
+    """Least time from the start to places this far from it, in their order."""
+    targets = np.array([(*(START + way), SMALL) for way in ways])
+    return least_time(len(ways), False, LIFT, GRAVITY)(START, targets)
+
+
+@pytest.mark.parametrize(
+    ("way", "acceleration"),
+    [
+        ((10.0, 0.0, 0.0), LEVEL),
+        ((0.0, 0.0, 10.0), LIFT - GRAVITY),
+        ((0.0, 0.0, -10.0), LIFT + GRAVITY),
+    ],
+)
+def test_a_straight_line_from_rest(way: tuple[float, float, float], acceleration: float) -> None:
+    expected = math.sqrt(2 * (10.0 - SMALL) / acceleration)
+    assert through_points(way) == pytest.approx(expected, rel=1e-4)
+
+
+def test_up_and_back_is_bang_bang() -> None:
+    """Thrust up, then down until the way back ends: speed is 0 at the upper point alone."""
+    up, down = LIFT - GRAVITY, LIFT + GRAVITY
+    expected = math.sqrt(2 * 3.0 * (1 / up + 1 / down)) + math.sqrt(2 * 3.0 / down)
+    found = through_points((0.0, 0.0, 3.0), (0.0, 0.0, 0.0))
+    assert found == pytest.approx(expected, rel=5e-3)  # thrust changes at ten even times
+
+
+def test_a_gate_is_passed_at_its_nearest_corner_below() -> None:
+    """Thrust of one direction: |way · 2 / t² + gravity| is the lift, a quadratic for 2 / t²."""
+    found = least_time(1, True, LIFT, GRAVITY)(START, np.array([gate(4.0, 2.0)]))
+    squared = 4.0**2 + 1.5**2 + 0.5**2
+    falls = 0.5 * GRAVITY
+    acceleration = (falls + math.sqrt(falls**2 + squared * LEVEL**2)) / squared
+    assert found == pytest.approx(math.sqrt(2 / acceleration), rel=1e-4)
+
+
+def test_a_gate_is_not_passed_against_its_direction() -> None:
+    """The way back through the gate needs another turn."""
+    solve = least_time(2, True, LIFT, GRAVITY)
+    last = gate(8.0, 0.0)
+    along = solve(START, np.array([gate(4.0, 0.0), last]))
+    against = solve(START, np.array([gate(4.0, 0.0, -1.0), last]))
+    assert along < against - 0.3
+
+
+def test_it_lies_above_the_bound_of_single_directions() -> None:
+    dice = np.random.default_rng(5)
+    places = START + dice.uniform(-3.0, 3.0, (4, 3))
+    weaker = course_time(np.vstack((START, places)), np.full(4, 0.3), LIFT, GRAVITY)
+    targets = np.column_stack((places, np.full(4, 0.3)))
+    found = least_time(4, False, LIFT, GRAVITY)(START, targets)
+    assert weaker < found < 2 * weaker
