@@ -27,7 +27,7 @@ from ..models.fields import (
     set_fields,
 )
 from ..models.files import read_toml
-from ..models.library import is_of_the_library, words_of
+from ..models.library import is_of_the_library, is_pool, words_of
 from ..scenes import SceneConfig
 from ..scenes.config import is_scene_file, refuse_hidden
 from ..scenes.returns import RANGES
@@ -149,6 +149,8 @@ class EnvConfig:
             check_names(task.defaults, _DEFAULTS, f"{self.env_id}: defaults")
             defaults |= {name: getattr(task, name) for name in _FROM_TASK}
             defaults |= task.defaults
+        if any(map(is_pool, words_of("vehicle", self.vehicle))):
+            defaults |= _OF_POOLS
         missing = [name for name in defaults if getattr(self, name) in (None, ())]
         set_fields(self, **{name: defaults[name] for name in missing})
         set_fields(
@@ -414,6 +416,8 @@ class EnvConfig:
 
 
 _DEFAULTS = ("vehicle", "sensors", "backend")
+_OF_POOLS = {"action": "wrench", "backend": BackendConfig(name="rigid")}
+"""What drawn craft need."""
 _FROM_TASK = ("action", "control_period", "episode_length")
 _OPTIONS = (
     "episode_length", "action", "control_period", "history", "effects", "randomize",

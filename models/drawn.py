@@ -16,6 +16,7 @@ import numpy as np
 
 from .errors import InputError
 from .files import read_own_toml
+from .library import is_pool
 
 SLOTS = 6
 """Most rotors of a drawn craft."""
@@ -120,7 +121,7 @@ def drawn_file(word: str) -> Path:
     process. Raises `InputError`.
     """
     numbers = range_of(word)
-    if len(numbers) > 1:
+    if is_pool(word):
         raise InputError(f"vehicle: expected one craft, as drawn:{numbers[0]}, got {word}")
     return _file_of(word.replace(":", "-"), drawn_craft(numbers))
 

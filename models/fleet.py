@@ -13,7 +13,7 @@ import numpy as np
 
 from .drawn import columns, drawn_craft, middle_file, range_of, table_of
 from .errors import InputError
-from .library import is_drawn, words_of
+from .library import is_pool, words_of
 from .vehicle import Vehicle
 
 _OF_DRONES = (
@@ -137,7 +137,7 @@ def load_vehicles(
 
 def _loaded(name: str | None, linear_drag: float) -> Vehicle:
     """One vehicle, or a `Pool` of drawn craft."""
-    if name and is_drawn(name) and len(range_of(name)) > 1:
+    if name and is_pool(name):
         return load_pool(name, linear_drag)
     return Vehicle.load(name, linear_drag=linear_drag)
 

@@ -42,6 +42,11 @@ def is_drawn(word: str) -> bool:
     return word == "drawn" or word.startswith("drawn:")
 
 
+def is_pool(word: str) -> bool:
+    """Whether a word stands for a pool of drawn craft, as `drawn` and `drawn:0-999`."""
+    return word == "drawn" or (is_drawn(word) and "-" in word)
+
+
 def is_of_the_library(vehicle: str) -> bool:
     """Whether a word stands for a vehicle that comes with the package, and for no file."""
     return (vehicle in vehicle_names() or is_drawn(vehicle)) and not os.path.isfile(vehicle)
