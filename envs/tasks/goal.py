@@ -31,6 +31,7 @@ ERROR_SCALE = 0.5  # Distance at which the reward for nearness crosses zero, m
 RATE_WEIGHT = 0.02  # Cost of a body rate of 1 rad/s
 PASSING_REWARD = 1.0  # Of a course: added in a step in which a point or gate is passed
 COURSE_RATE_WEIGHT = 0.002  # Of a course: cost of a body rate of 1 rad/s
+COURSE_TIME_COST = 0.04  # Of a course: of each step
 FASTEST_COUNTED = 20.0  # A faster body rate costs no more, rad/s
 WORST_RATES = -RATE_WEIGHT * FASTEST_COUNTED
 COURSE_WORST_RATES = -COURSE_RATE_WEIGHT * FASTEST_COUNTED

@@ -68,7 +68,7 @@ def test_what_is_a_pass(before: Any, after: Any, passes: bool) -> None:
 def test_a_lap_by_hand() -> None:
     task = begun(laps=2)
     outcome = moved(task, 1.5, 0.0, 5.0, body_rates=(3.0, 0.0, 4.0))
-    expected = {"progress": 1.5, "passing": 0.0, "rates": -0.01, "termination": 0.0}
+    expected = {"progress": 1.5, "passing": 0.0, "time": -0.04, "rates": -0.01, "termination": 0.0}
     reward = {name: float(value) for name, value in outcome.reward.items()}
     assert reward == pytest.approx(expected)
     outcome = moved(task, 2.5, 0.0, 5.0)  # 0.5 m before the gate, 0.5 m behind it
