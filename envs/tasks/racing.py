@@ -134,7 +134,7 @@ class Racing(GoalTask):
 
     By how much the craft came nearer to the centre of the gate in this step, 1/m, the progress of
     Song et al. 2021 (arXiv 2103.08624); 1 on the step that passes it; -0.04; -0.002 s/rad times the
-    size of the body rates, up to 20 rad/s; and -5 on a step that terminates with gates left. The
+    size of the body rates, up to 20 rad/s; and -8 on a step that terminates with gates left. The
     last three weights are those of `Waypoints`.
 
     A gate is passed in a step whose straight way goes through its opening in its direction; one

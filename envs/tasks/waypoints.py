@@ -67,7 +67,7 @@ class Waypoints(GoalTask):
     ## Reward
 
     By how much the craft came nearer to the point in this step, 1/m; 1 on the step that reaches
-    it; -0.04; -0.002 s/rad times the size of the body rates, up to 20 rad/s; and -5 on a step that
+    it; -0.04; -0.002 s/rad times the size of the body rates, up to 20 rad/s; and -8 on a step that
     terminates with points left. Progress pays 1 for a metre, not for a step: with 0.02 s/rad, as
     `Hover` has it, and -20 for a crash a turn costs more than it brings, and a craft that hovers
     loses nothing.

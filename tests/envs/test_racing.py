@@ -93,7 +93,7 @@ def test_a_lap_by_hand() -> None:
 def test_ends(place: Any, rest: dict[str, Any], ends: bool) -> None:
     outcome = moved(begun(), *place, **rest)
     assert bool(outcome.terminated) == ends
-    assert outcome.reward["termination"] == pytest.approx(-5.0 * ends)
+    assert outcome.reward["termination"] == pytest.approx(-8.0 * ends)
 
 
 def test_a_track_of_a_file_crosses_the_wire(tmp_path: Path) -> None:

@@ -94,7 +94,7 @@ def test_ends(place: tuple[float, float, float], rest: dict[str, Any], ends: boo
     task = begun(MIDDLE, (0.0, 0.0, 0.0), ABOVE)
     outcome = moved(task, *place, **rest)
     assert bool(outcome.terminated) == ends
-    assert outcome.reward["termination"] == pytest.approx(-5.0 * ends)
+    assert outcome.reward["termination"] == pytest.approx(-8.0 * ends)
 
 
 @pytest.mark.parametrize("name", [None, "crazyflie2"])
