@@ -36,10 +36,11 @@ HEADING_WEIGHT = 0.2  # Cost of a heading half a turn off
 RATE_WEIGHT = 0.02  # Cost of a body rate of 1 rad/s
 PASSING_REWARD = 1.0  # Of a course: added in a step in which a point or gate is passed
 COURSE_RATE_WEIGHT = 0.002  # Of a course: cost of a body rate of 1 rad/s
+COURSE_TIME_COST = 0.04  # Of a course: of each step
 FASTEST_COUNTED = 20.0  # A faster body rate costs no more, rad/s
 WORST_RATES = -RATE_WEIGHT * FASTEST_COUNTED
 COURSE_WORST_RATES = -COURSE_RATE_WEIGHT * FASTEST_COUNTED
-COURSE_WORST_STEP = -0.05  # Of a course: a hundredth of the cost of a crash
+COURSE_WORST_STEP = -COURSE_TIME_COST + COURSE_WORST_RATES
 LEAST_TILT_COSINE = 0.0
 """Cosine of the tilt (90°) past which the craft counts as flipped over."""
 SHIFT = ("goal_x", "goal_y", "goal_z")  # parameters of events that move a goal

@@ -34,6 +34,7 @@ from ..spec import Mark, Metric
 from ..state import State
 from .goal import (
     COURSE_RATE_WEIGHT,
+    COURSE_TIME_COST,
     COURSE_WORST_STEP,
     FLIGHT_TIME,
     PASSING_REWARD,
@@ -132,9 +133,9 @@ class Racing(GoalTask):
     ## Reward
 
     By how much the craft came nearer to the centre of the gate in this step, 1/m, the progress of
-    Song et al. 2021 (arXiv 2103.08624); 1 on the step that passes it; -0.002 s/rad times the size
-    of the body rates, up to 20 rad/s; and -5 on a step that terminates with gates left. The last
-    two weights are those of `Waypoints`.
+    Song et al. 2021 (arXiv 2103.08624); 1 on the step that passes it; -0.04; -0.002 s/rad times the
+    size of the body rates, up to 20 rad/s; and -8 on a step that terminates with gates left. The
+    last three weights are those of `Waypoints`.
 
     A gate is passed in a step whose straight way goes through its opening in its direction; one
     gate in a step at most.
@@ -267,7 +268,11 @@ class Racing(GoalTask):
         memory = self.memory
         left = self._total - memory.passed
         crashed = (memory.off > self.options.margin) | state.touching
-        terms = {"progress": memory.progress, "passing": PASSING_REWARD * memory.passing}
+        terms = {
+            "progress": memory.progress,
+            "passing": PASSING_REWARD * memory.passing,
+            "time": -COURSE_TIME_COST,
+        }
         metrics = {"gates_left": left, "flight_time": state.time, "lap_time": memory.lap}
         return self.judged(state, terms, crashed, metrics, left < 0.5, COURSE_RATE_WEIGHT)
 

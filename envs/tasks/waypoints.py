@@ -10,6 +10,7 @@ from ..spec import Mark, Metric
 from ..state import State
 from .goal import (
     COURSE_RATE_WEIGHT,
+    COURSE_TIME_COST,
     COURSE_WORST_STEP,
     FLIGHT_TIME,
     FURTHEST,
@@ -66,7 +67,7 @@ class Waypoints(GoalTask):
     ## Reward
 
     By how much the craft came nearer to the point in this step, 1/m; 1 on the step that reaches
-    it; -0.002 s/rad times the size of the body rates, up to 20 rad/s; and -5 on a step that
+    it; -0.04; -0.002 s/rad times the size of the body rates, up to 20 rad/s; and -8 on a step that
     terminates with points left. Progress pays 1 for a metre, not for a step: with 0.02 s/rad, as
     `Hover` has it, and -20 for a crash a turn costs more than it brings, and a craft that hovers
     loses nothing.
@@ -137,7 +138,11 @@ class Waypoints(GoalTask):
         left = options.points - memory.reached
         off = abs(state.position - np.array(options.center))
         crashed = (off > self._sides).any(axis=-1) | state.touching
-        terms = {"progress": memory.progress, "passing": PASSING_REWARD * memory.passed}
+        terms = {
+            "progress": memory.progress,
+            "passing": PASSING_REWARD * memory.passed,
+            "time": -COURSE_TIME_COST,
+        }
         metrics = {"points_left": left, "flight_time": state.time}
         return self.judged(state, terms, crashed, metrics, left < 0.5, COURSE_RATE_WEIGHT)
 

@@ -73,7 +73,7 @@ def test_the_tuned_preset_depends_on_the_task() -> None:
     assert racing.config.hidden == (64, 64)
     assert racing.config.log_std == -0.8
     waypoints = find_preset("ppo", "tuned", "rotorgram/Waypoints-v0").config
-    own = {"log_std": -0.8, "epochs": 2, "minibatches": 32}
+    own = {"log_std": -0.8, "epochs": 2, "minibatches": 32, "gamma": 0.98}
     assert replace(waypoints, **own) == racing.config
     other = find_preset("ppo", "tuned", "other/Task-v0")
     assert other == replace(ours, fits=False, backend=None)  # it may need contact

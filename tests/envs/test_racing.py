@@ -68,7 +68,7 @@ def test_what_is_a_pass(before: Any, after: Any, passes: bool) -> None:
 def test_a_lap_by_hand() -> None:
     task = begun(laps=2)
     outcome = moved(task, 1.5, 0.0, 5.0, body_rates=(3.0, 0.0, 4.0))
-    expected = {"progress": 1.5, "passing": 0.0, "rates": -0.01, "termination": 0.0}
+    expected = {"progress": 1.5, "passing": 0.0, "time": -0.04, "rates": -0.01, "termination": 0.0}
     reward = {name: float(value) for name, value in outcome.reward.items()}
     assert reward == pytest.approx(expected)
     outcome = moved(task, 2.5, 0.0, 5.0)  # 0.5 m before the gate, 0.5 m behind it
@@ -93,7 +93,7 @@ def test_a_lap_by_hand() -> None:
 def test_ends(place: Any, rest: dict[str, Any], ends: bool) -> None:
     outcome = moved(begun(), *place, **rest)
     assert bool(outcome.terminated) == ends
-    assert outcome.reward["termination"] == pytest.approx(-5.0 * ends)
+    assert outcome.reward["termination"] == pytest.approx(-8.0 * ends)
 
 
 def test_a_track_of_a_file_crosses_the_wire(tmp_path: Path) -> None:

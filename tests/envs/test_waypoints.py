@@ -67,7 +67,7 @@ def test_observation_by_hand(action: str, expected: list[float]) -> None:
 def test_progress_and_passing_by_hand() -> None:
     task = begun(MIDDLE, EAST, ABOVE, radius=0.5)
     outcome = moved(task, 1.0, 0.0, 5.0, body_rates=(3.0, 0.0, 4.0))
-    expected = {"progress": 1.0, "passing": 0.0, "rates": -0.01, "termination": 0.0}
+    expected = {"progress": 1.0, "passing": 0.0, "time": -0.04, "rates": -0.01, "termination": 0.0}
     told = {name: float(value) for name, value in outcome.reward.items()}
     assert told == pytest.approx(expected)
     outcome = moved(task, 0.5, 0.0, 5.0)
@@ -94,7 +94,7 @@ def test_ends(place: tuple[float, float, float], rest: dict[str, Any], ends: boo
     task = begun(MIDDLE, (0.0, 0.0, 0.0), ABOVE)
     outcome = moved(task, *place, **rest)
     assert bool(outcome.terminated) == ends
-    assert outcome.reward["termination"] == pytest.approx(-5.0 * ends)
+    assert outcome.reward["termination"] == pytest.approx(-8.0 * ends)
 
 
 @pytest.mark.parametrize("name", [None, "crazyflie2"])
