@@ -24,7 +24,8 @@ class Config:
     network: str = "mlp"
     """`mlp`, or `cnn` with convolutions over images and rings: see `networks.NETWORKS`."""
     reach: Positive | None = None
-    """Of a length d, m, that is observed a network sees d / (1 + |d| / reach); null: all of it."""
+    """Of an observed length d, m, a network sees d / (1 + |d| / reach), or with a reach below 1 m
+    d / (reach + |d|); null: all of it."""
     filters: Sizes = (4, 8, 16)
     """Filters of each convolution of a `cnn`."""
     memory: Annotated[int, Limits(0, 4096, whole=True)] = 0

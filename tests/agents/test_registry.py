@@ -157,5 +157,5 @@ def test_train_says_where_no_preset_fits(
     assert main([*words, "--out", str(tmp_path / "b")]) == 0
     assert "note: there is no preset" not in capsys.readouterr().out
     kept = load(tmp_path / "b" / "checkpoint.safetensors")
-    assert kept.config["hidden"] == [64, 64]
-    assert kept.num_envs == 160
+    assert kept.config["hidden"] == [32, 32]
+    assert kept.num_envs == 1024
