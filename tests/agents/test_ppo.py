@@ -76,10 +76,13 @@ def test_the_tuned_preset_depends_on_the_task() -> None:
     swarm = find_preset("ippo", "tuned", "rotorgram/Formation-v0")
     assert (swarm.num_envs, swarm.env_steps, swarm.backend) == (1024, 8_000_000, "rigid")
     assert swarm.episode_length == 100
-    assert swarm.config.anneal_clip  # a crash comes to have its full cost
+    assert swarm.config.reward_clip is None  # a crash has its full cost
     for algorithm in ("ppo", "mappo"):
+        escort = find_preset(algorithm, "tuned", "rotorgram/Escort-v0")
+        assert escort == replace(swarm, env_id="rotorgram/Escort-v0")
         crossing = find_preset(algorithm, "tuned", "rotorgram/Crossing-v0")
-        assert crossing == replace(swarm, env_id="rotorgram/Crossing-v0")
+        growing = replace(swarm.config, reward_clip=3.0, anneal_clip=True)
+        assert crossing.config == growing
     with pytest.raises(InputError, match="preset: expected robust or tuned for ppo, got 'paper'"):
         find_preset("ppo", "paper")
 
