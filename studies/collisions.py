@@ -5,13 +5,13 @@
 
 For each task and seed `rotorgram train ippo --drones 4 --env.neighbours 3` trains a policy with its
 preset; the clock runs from before the process starts to after it has ended. It then flies with each
-number of drones, whole episodes of the task, from starts that no training has seen, on `rigid`,
-where drones have touched as soon as their spheres overlap. ORCA flies some starts of that kind.
+number of drones, whole episodes of the task, from starts that no training has seen, on `mujoco`.
+ORCA flies some starts of that kind.
 `docs/results/collisions_flights.npz` gets the steady error of every flight in millimetres, 65535 of
 one that crashed, from which `--only-sums` computes `docs/results/collisions.json` again. Flights of
 other tasks stay in it.
 
-It takes some half an hour on two cores.
+It takes more than an hour on two cores.
 """
 
 import subprocess
@@ -55,7 +55,7 @@ def flown(pilot: str, task: str, drones: int, flights: int, seed: int) -> np.nda
         f"rotorgram/{task}-v0",
         vehicle="crazyflie2",
         drones=drones,
-        backend="rigid",
+        backend="mujoco",
         neighbours=NEIGHBOURS,
     )
     worlds = flights // drones

@@ -78,11 +78,9 @@ def test_the_tuned_preset_depends_on_the_task() -> None:
     assert swarm.episode_length == 100
     assert swarm.config.reward_clip is None  # a crash has its full cost
     for algorithm in ("ppo", "mappo"):
-        escort = find_preset(algorithm, "tuned", "rotorgram/Escort-v0")
-        assert escort == replace(swarm, env_id="rotorgram/Escort-v0")
-        crossing = find_preset(algorithm, "tuned", "rotorgram/Crossing-v0")
-        growing = replace(swarm.config, reward_clip=3.0, anneal_clip=True)
-        assert crossing.config == growing
+        for task, most in (("Crossing", 3.0), ("Escort", 8.0)):
+            other = find_preset(algorithm, "tuned", f"rotorgram/{task}-v0")
+            assert other.config == replace(swarm.config, reward_clip=most, anneal_clip=True)
     with pytest.raises(InputError, match="preset: expected robust or tuned for ppo, got 'paper'"):
         find_preset("ppo", "paper")
 
