@@ -24,7 +24,8 @@ class Config:
     network: str = "mlp"
     """`mlp`, or `cnn` with convolutions over images and rings: see `networks.NETWORKS`."""
     reach: Positive | None = None
-    """Of a length d, m, that is observed a network sees d / (1 + |d| / reach); null: all of it."""
+    """Of an observed length d, m, a network sees d / (1 + |d| / reach), or with a reach below 1 m
+    d / (reach + |d|); null: all of it."""
     filters: Sizes = (4, 8, 16)
     """Filters of each convolution of a `cnn`."""
     memory: Annotated[int, Limits(0, 4096, whole=True)] = 0
@@ -43,6 +44,8 @@ class Config:
     """Factor of the rewards that it learns from; returns are shown without it."""
     reward_clip: Positive | None = None
     """Largest size of a reward that it learns from, after `reward_scale`; null: any."""
+    anneal_clip: bool = False
+    """Raise `reward_clip` over the run: to twice as much at its half, to ten times at 9/10."""
     log_std: Annotated[float, LOG_STD] = -0.5
     """Initial logarithm of the policy's standard deviation, in units of the action."""
 
@@ -53,15 +56,21 @@ class Config:
 
     def __post_init__(self) -> None:
         check_fields(self)
+        if self.anneal_clip and self.reward_clip is None:
+            raise InputError("anneal_clip: expected a reward_clip with it, got null")
         if self.memory and not self.remembers:
             own = type(self).__name__
             raise InputError(f"memory: expected 0 with {own}, got {self.memory}; ppo trains one")
 
-    def scaled(self, rewards: NDArray[np.float64]) -> NDArray[np.float64]:
-        """The rewards that it learns from."""
+    def scaled(self, rewards: NDArray[np.float64], left: float = 1.0) -> NDArray[np.float64]:
+        """The rewards that it learns from, with this share of the run left."""
         scaled = self.reward_scale * rewards
         most = self.reward_clip
-        return scaled if most is None else np.clip(scaled, -most, most)
+        if most is None:
+            return scaled
+        if self.anneal_clip:
+            most /= left
+        return np.clip(scaled, -most, most)
 
     def least_steps(self, drones: int, episode_length: int) -> int:
         """Env steps that a training needs for one update, with all drones together."""

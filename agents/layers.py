@@ -233,10 +233,13 @@ class Chain(Layer):
 
 class Scaling(Layer):
     """Distances as nearness, bytes of pictures as 0 to 1, and lengths d as d / (1 + |d| / reach),
-    in their place; the others stay.
+    or with a reach below 1 m as d / (reach + |d|), in their place; the others stay.
 
     A distance d >= 0 m is 2 / (1 + d / 2 m) - 1 / 2: what is near differs most. `distances`,
     `pictures` and `lengths` are slices of the inputs.
+
+    Attributes:
+        unit: Slope of a length at 0 is one over this: 1 m, or the reach if that is shorter.
     """
 
     def __init__(
@@ -250,6 +253,7 @@ class Scaling(Layer):
         self.pictures = pictures
         self.lengths = lengths if reach else ()
         self.reach = np.float32(reach or 1.0)
+        self.unit = np.minimum(self.reach, np.float32(1.0))
 
     def forward(self, inputs: Floats) -> Floats:
         self._seen = seen = inputs[..., 1:, :]
@@ -266,7 +270,7 @@ class Scaling(Layer):
         for place in self.lengths:
             values = seen[..., place, :]
             factors = 1.0 / (1.0 + np.abs(values) / self.reach)
-            values *= factors
+            values *= factors / self.unit
             self._factors.append(factors)
         return inputs
 
@@ -277,7 +281,7 @@ class Scaling(Layer):
         for place in self.pictures:
             slope[..., place, :] /= BRIGHTEST
         for place, factors in zip(self.lengths, self._factors, strict=True):
-            slope[..., place, :] *= factors * factors
+            slope[..., place, :] *= factors * factors / self.unit
         return slope
 
 

@@ -93,9 +93,10 @@ class Learner:
         while log.env_steps < env_steps:
             before = log.env_steps
             rollout = self.collect(collector, env_steps - before)
-            rollout = replace(rollout, rewards=self.config.scaled(rollout.rewards))
+            left = 1 - before / env_steps
+            rollout = replace(rollout, rewards=self.config.scaled(rollout.rewards, left))
             if self.config.anneal:
-                self.rate = self.config.learning_rate * (1 - before / env_steps)
+                self.rate = self.config.learning_rate * left
             if len(rollout):
                 with np.errstate(over="ignore", invalid="ignore"):  # Diverged is raised below
                     self.update(rollout)

@@ -128,6 +128,12 @@ class MAPPO(PPO):
     To judge a drone it sees that drone's observation and then those of the others, from the next
     one on by their names; zeros for a drone that is out. The actor sees what its drone sees, as
     PPO's.
+
+    As in the paper: shared parameters, a state of the agent's own for the critic, generalised
+    advantages that are normalised, the clipped objective. Not as there: values are not normalised,
+    a rollout has as many minibatches as PPO's (the paper advises one or two), the loss of the value
+    is neither clipped nor Huber's, and a drone that is out has no transition, where the paper's
+    death masking gives zeros to the agent that is judged.
     """
 
     central = True

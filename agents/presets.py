@@ -17,7 +17,7 @@ PresetName = Literal["paper", "tuned", "robust"]
 DEFAULT_TASK = "rotorgram/Elevation-v0"
 """Its presets serve tasks for which there is no other."""
 
-_FLIGHT = ("num_envs", "env_steps", "backend", "perturbations")
+_FLIGHT = ("num_envs", "env_steps", "backend", "episode_length", "perturbations")
 
 Tables = dict[str, dict[str, dict[str, Any]]]
 
@@ -37,6 +37,8 @@ class Preset:
     """Of all drones together."""
     backend: Backend | None = None
     """Of the training; None: the task's."""
+    episode_length: int | None = None
+    """Control steps of an episode of the training that names none; None: the task's."""
     perturbations: Mapping[str, float] = field(default_factory=dict, hash=False)
     """What each episode draws: names of `envs.perturbations` and sizes."""
 

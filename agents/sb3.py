@@ -156,6 +156,8 @@ class SB3Agent:
         if config.network != "mlp" or config.memory or config.reach:
             got = f"{config.network!r} with a memory of {config.memory} and reach {config.reach}"
             raise InputError(f"network: expected mlp without memory and reach with SB3, got {got}")
+        if config.anneal_clip:
+            raise InputError("anneal_clip: expected false with SB3, got true")
         if log.spec != log.spec.for_actor():
             raise InputError("sb3: expected no privileged arrays, which SB3's actor would see too")
         if any(scaled_in(log.spec.observation)):

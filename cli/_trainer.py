@@ -70,6 +70,10 @@ def begin(command: "Train") -> int:
     config = preset(command.algorithm, name, task, **command.changes())
     backend = command.backend or base.backend
     flown = command.env_config(backend=backend)  # it refuses wrong drones
+    chosen = "episode_length" in command.options or command.listen is not None
+    if base.episode_length and not chosen:
+        flown = flown.changed(episode_length=base.episode_length)
+        command = replace(command, options=flown.flat_options())
     if base.perturbations:
         flown, refused = for_training(flown, base.perturbations)
         for perturbation, sentence in refused.items():

@@ -27,7 +27,7 @@ from .stages.record import Mask, Record
 from .telemetry import telemetry_of
 
 LANES = 64  # Worlds of a block: their numbers fit into the nearest cache
-MOST = 60_000  # Operations of a step but those of functions: more take too long to compile
+MOST = 65_000  # Operations of a step but those of functions: more take too long to compile
 _FIRST, _CONTROL, _PUSH, _BEGIN, _LAST = "first", "control", "push", "begin", "last"
 """Code before the physics of a step, between two of its calls, for episodes that begin, and after.
 A step whose physics is array code is the last alone."""

@@ -183,6 +183,9 @@ class Row:
         backend = replace(self.env.backend, name=self.backend or self.env.backend.name)
         env = replace(self.env, backend=backend)
         found = find_preset(self.agent, self.preset, self.env.env_id)
+        usual = EnvConfig(env_id=env.env_id).episode_length
+        if found.episode_length and env.episode_length == usual:
+            env = env.changed(episode_length=found.episode_length)
         if found.perturbations:
             env, _ = for_training(env, found.perturbations)
         return Run(

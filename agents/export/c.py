@@ -251,7 +251,8 @@ class _Program:
             self._each(f"{seen}[i] = 2.0f / (1.0f + {seen}[i]) - 0.5f;", place)
         for place in layer.lengths:
             size = f"({seen}[i] < 0.0f ? -{seen}[i] : {seen}[i])"
-            self._each(f"{seen}[i] /= 1.0f + {size} / {layer.reach}f;", place)
+            softer = f"(1.0f + {size} / {layer.reach}f)"
+            self._each(f"{seen}[i] /= {layer.unit}f * {softer};", place)
 
     def _act(self, policy: NetworkPolicy) -> None:
         """Map the outputs to the range of the action, and clip them to its bounds."""

@@ -106,6 +106,7 @@ class _Graph:
         softer = np.zeros_like(mask)
         for place in layer.lengths:
             softer[:, place] = 1.0 / layer.reach
+            factor[:, place] /= layer.unit
         half = np.float32(0.5)
         self.then("Mul", half * mask)
         self.then("Relu")

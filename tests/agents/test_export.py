@@ -188,6 +188,7 @@ CASES: dict[str, Callable[[], NetworkPolicy]] = {
     "of relu": lambda: policy_of(sighted(), (16,), network="cnn"),
     "linear": lambda: policy_of(spec_of(), ()),
     "softened": lambda: policy_of(hover(vehicle="crazyflie2"), (32,), "tanh", reach=2.5),
+    "near": lambda: policy_of(hover(vehicle="crazyflie2"), (32,), "tanh", reach=0.25),
 }
 RUNNERS = {"onnxruntime": by_onnxruntime, "gcc": by_gcc, "g++": by_gpp}
 

@@ -219,16 +219,17 @@ def test_distances_come_in_as_nearness() -> None:
     scales_as_torch(network, weights, inputs, tensor, torch.where(is_near, nearness, tensor))
 
 
-def test_lengths_come_in_softened() -> None:
+@pytest.mark.parametrize(("reach", "unit"), [(2.0, 1.0), (0.5, 0.5)])
+def test_lengths_come_in_softened(reach: float, unit: float) -> None:
     units = ("m", "m/s", "m")
     seen = ArraySpec(name="seen", shape=(3,), low=-9.0, high=9.0, unit=units)
     height = ArraySpec(name="height", shape=(1,), low=0.0, high=9.0, unit="m")
     last = ArraySpec(name="last", shape=(2,), low=-9.0, high=9.0, unit="m")
-    network = Network([seen, height, last], 2, config_of((4,), "tanh", reach=2.0))
+    network = Network([seen, height, last], 2, config_of((4,), "tanh", reach=reach))
     weights = bound(network)
     weights.values[:] = normal(weights.values.size)
     inputs = normal(6, BATCH) * 3.0
     tensor = torch.tensor(inputs.T, requires_grad=True)
     is_length = torch.tensor([True, False, True, False, True, True])
-    softened = tensor / (1 + tensor.abs() / 2)
+    softened = tensor / unit / (1 + tensor.abs() / reach)
     scales_as_torch(network, weights, inputs, tensor, torch.where(is_length, softened, tensor))

@@ -78,11 +78,13 @@ def test_the_tuned_preset_depends_on_the_task() -> None:
     other = find_preset("ppo", "tuned", "other/Task-v0")
     assert other == replace(ours, fits=False, backend=None)  # it may need contact
     swarm = find_preset("ippo", "tuned", "rotorgram/Formation-v0")
-    assert (swarm.num_envs, swarm.env_steps, swarm.backend) == (160, 2_000_000, "rigid")
-    assert swarm.config.reward_clip == 2.0
-    for algorithm in ("ppo", "mappo", "sb3-ppo"):
-        crossing = find_preset(algorithm, "tuned", "rotorgram/Crossing-v0")
-        assert crossing == replace(swarm, env_id="rotorgram/Crossing-v0")
+    assert (swarm.num_envs, swarm.env_steps, swarm.backend) == (1024, 8_000_000, "rigid")
+    assert swarm.episode_length == 100
+    assert swarm.config.reward_clip is None  # a crash has its full cost
+    for algorithm in ("ppo", "mappo"):
+        for task, most in (("Crossing", 3.0), ("Escort", 8.0)):
+            other = find_preset(algorithm, "tuned", f"rotorgram/{task}-v0")
+            assert other.config == replace(swarm.config, reward_clip=most, anneal_clip=True)
     with pytest.raises(InputError, match="preset: expected robust or tuned for ppo, got 'paper'"):
         find_preset("ppo", "paper")
 
@@ -97,6 +99,17 @@ def test_training_of_hover_is_robust_if_nothing_else_is_asked(tmp_path: Path) ->
     assert kept.config["reach"] == robust.config.reach
     assert {"start_y", "start_tilt", "mass"} <= {*kept.spec.options["randomize"]}
     assert all(np.isfinite(array).all() for array in kept.policy().weights.arrays.values())
+
+
+@pytest.mark.parametrize(("words", "length"), [([], 100), (["--episode-length", "500"], 500)])
+def test_swarms_train_in_short_episodes_if_no_length_is_given(
+    words: list[str], length: int, tmp_path: Path
+) -> None:
+    folder = tmp_path / "run"
+    few = ["--num-envs", "4", "--env-steps", "400", "--set", "steps_per_update=400"]
+    swarm = ["train", "ippo", "--env", "rotorgram/Formation-v0", "--drones", "2", *few]
+    assert main([*swarm, *words, "--out", str(folder)]) == 0
+    assert load(folder / "checkpoint.safetensors").spec.options["episode_length"] == length
 
 
 def test_training_by_the_command_takes_the_preset_s_drones_and_loads_nothing_slow(

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
+import numpy as np
 import pytest
 from rotorgram.agents import (
     A2CConfig,
@@ -125,6 +126,21 @@ def test_sb3_takes_its_own_networks_alone() -> None:
         InputError, match="network: expected mlp without memory and reach with SB3, got"
     ):
         make_agent("sb3-ppo", EpisodeRecorder(vector(), 0), PPOConfig(network="wide"), 0)
+    growing = PPOConfig(reward_clip=2.0, anneal_clip=True)
+    with pytest.raises(InputError, match="anneal_clip: expected false with SB3, got true"):
+        make_agent("sb3-ppo", EpisodeRecorder(vector(), 0), growing, 0)
+
+
+def test_a_clip_of_rewards_grows_over_the_run() -> None:
+    growing = PPOConfig(reward_scale=0.5, reward_clip=2.0, anneal_clip=True)
+    rewards = np.array([-240.0, -8.0, 1.0])
+    for left, expected in ((1.0, [-2.0, -2.0, 0.5]), (0.5, [-4.0, -4.0, 0.5])):
+        assert growing.scaled(rewards, left) == pytest.approx(expected)
+    assert growing.scaled(rewards, 0.01) == pytest.approx([-120.0, -4.0, 0.5])
+    fixed = PPOConfig(reward_clip=2.0)
+    assert fixed.scaled(rewards, 0.5) == pytest.approx([-2.0, -2.0, 1.0])
+    with pytest.raises(InputError, match="anneal_clip: expected a reward_clip with it, got null"):
+        PPOConfig(anneal_clip=True)
 
 
 # ---- presets
@@ -157,5 +173,5 @@ def test_train_says_where_no_preset_fits(
     assert main([*words, "--out", str(tmp_path / "b")]) == 0
     assert "note: there is no preset" not in capsys.readouterr().out
     kept = load(tmp_path / "b" / "checkpoint.safetensors")
-    assert kept.config["hidden"] == [64, 64]
-    assert kept.num_envs == 160
+    assert kept.config["hidden"] == [32, 32]
+    assert kept.num_envs == 1024
