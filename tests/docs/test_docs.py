@@ -8,6 +8,7 @@ from typing import Any
 import pandas as pd
 import pytest
 import robust
+import universal
 from rotorgram.envs.config import EnvConfig
 from rotorgram.envs.registry import env_spec
 from rotorgram.training.report import judge
@@ -303,6 +304,16 @@ def test_the_page_of_robust_policies_has_what_every_flight_says(
     committed = result("robust")
     assert {vehicle: committed[vehicle] for vehicle in found} == found
     check("robustness", *(" ".join(row.split()) for row in robust.page(found).splitlines()))
+
+
+def test_the_page_of_the_universal_policy_has_what_every_flight_says(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.chdir(RESULTS.parent.parent)
+    found = universal.sums()
+    committed = result("universal")
+    assert {name: committed[name] for name in found} == found
+    check("robustness", *(" ".join(row.split()) for row in universal.page(found).splitlines()))
 
 
 def crashes_of(found: dict[str, Any]) -> str:
