@@ -106,6 +106,6 @@ def test_wrong_names(tmp_path: Path, capsys: Capsys) -> None:
         capsys, "evaluate", "still.py"
     )
     told = refused(capsys, "evaluate", "nobody")
-    assert "expected pid, geometric, raptor, FILE.py:CLASS of a controller, a checkpoint" in told
+    assert "expected universal, pid, geometric, raptor, FILE.py:CLASS of a controller" in told
     with pytest.raises(InputError, match="agent: expected one of pid, geometric, raptor, vpg, a2c"):
         Row(agent="nobody")
