@@ -91,7 +91,24 @@ class Checkpoint:
 
     def policy(self, spec: EnvSpec | None = None) -> NetworkPolicy:
         """The policy, ready to fly that env or its own. Raises `InputError` if it does not fit."""
+        if spec:
+            _check_meaning(self.spec, spec)
         return NetworkPolicy.load(self.actor, spec or self.spec, self.hyperparameters)
+
+
+def _check_meaning(own: EnvSpec, other: EnvSpec) -> None:
+    """Raise `InputError` where numbers of the same shape mean something else in another env."""
+    pairs = [*zip(own.observation, other.observation, strict=False), (own.action, other.action)]
+    for ours, theirs in pairs:
+        if getattr(ours, "shape", ()) != getattr(theirs, "shape", ()):
+            continue  # the weights do not fit, which is refused later
+        for what in ("frame", "components"):
+            expected, got = (getattr(one, what, "") for one in (ours, theirs))
+            if expected and got and expected != got:
+                raise InputError(
+                    f"policy: expected {ours.name} with the {what} {shortened(expected)}, on which "
+                    f"it was trained, got {shortened(got)}"
+                )
 
 
 def store(checkpoint: Checkpoint, path: Path) -> None:

@@ -21,6 +21,7 @@ from ..envs.registry import env_spec, is_known, task_type
 from ..envs.spec import EnvSpec
 from ..flights.trajectories import Trajectory
 from ..models import Backend, InputError
+from ..models.library import is_pool
 from ._flags import AgentFlags, EnvFlags, Options, parse_address
 
 if TYPE_CHECKING:
@@ -118,7 +119,7 @@ def in_unseen(command: F) -> F:
 
 def policy_for(command: EnvFlags, checkpoint: Pilot, spec: EnvSpec) -> Policy:
     """The policy of a checkpoint, or a controller. Raises `InputError` if it does not fit the env,
-    or was trained on another vehicle and the user has not named one.
+    or was trained on another vehicle, no pool of craft, and the user has not named one.
     """
     if isinstance(checkpoint, type):
         return checkpoint(spec)
@@ -126,7 +127,7 @@ def policy_for(command: EnvFlags, checkpoint: Pilot, spec: EnvSpec) -> Policy:
     drags = [one.options.get("effects", {}).get("linear_drag") for one in (own, spec)]
     same_drag = drags[0] == drags[1]
     other = own.vehicle_hash != spec.vehicle_hash and same_drag
-    if other and "vehicle" not in command.given:
+    if other and "vehicle" not in command.given and not is_pool(own.vehicle):
         raise InputError(
             f"vehicle: expected {own.vehicle_text}, on which the policy was trained, "
             f"got {spec.vehicle_text}; name one with --vehicle"

@@ -97,13 +97,14 @@ class EnvFlags(Command):
     Its options are flags --env.NAME."""
     vehicle: Annotated[str | None, arg(metavar="FILE")] = None
     """TOML or MJCF file of a multirotor, or the name of one of the library; several with commas
-    between them, for the drones of a world in turn. Default: the paper's quadcopter."""
+    between them, for the drones of a world in turn. drawn:7 is a drawn craft, drawn another one in
+    each episode. Default: the paper's quadcopter."""
     config_file: Annotated[Path | None, arg(name="config", metavar="FILE")] = None
     """TOML file with the env and everything that it is flown with, by the names of these flags and
     of the task's options. Flags win."""
     action: str | None = None
-    """Action level: rotors, rates, attitude, velocity, position, offset or increment. Default: the
-    task's."""
+    """Action level: rotors, wrench, rates, attitude, velocity, position, offset or increment.
+    Default: the task's."""
     control_period: float | None = None
     """Seconds between two actions: a multiple of the physics step. Default: the task's."""
     episode_length: int | None = None

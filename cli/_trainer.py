@@ -74,6 +74,7 @@ def begin(command: "Train") -> int:
     if base.episode_length and not chosen:
         flown = flown.changed(episode_length=base.episode_length)
         command = replace(command, options=flown.flat_options())
+        print(f"note: preset {name}: episodes of {base.episode_length} control steps")
     if base.perturbations:
         flown, refused = for_training(flown, base.perturbations)
         for perturbation, sentence in refused.items():

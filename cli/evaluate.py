@@ -16,7 +16,8 @@ class Evaluate(AgentFlags, MavlinkFlags):
     """Measure a trained policy or a controller over episodes without exploration."""
 
     policy: Positional[Annotated[str, arg(metavar="POLICY")]]
-    """Checkpoint, folder of a training, pid, geometric, raptor, or a controller: FILE.py:CLASS."""
+    """Checkpoint, folder of a training, universal, pid, geometric, raptor, or a controller:
+    FILE.py:CLASS."""
     episodes: Count | None = None
     """Episodes to fly, from seeds that no training uses. Default: 20; of each cell of the table of
     --robustness 1,000."""

@@ -16,7 +16,8 @@ class Serve(AgentFlags):
     """
 
     policy: Positional[str]
-    """Checkpoint, folder of a training, pid, geometric, raptor, or a controller: FILE.py:CLASS."""
+    """Checkpoint, folder of a training, universal, pid, geometric, raptor, or a controller:
+    FILE.py:CLASS."""
     listen: Annotated[str | None, arg(metavar="HOST:PORT")] = "127.0.0.1:8001"
     """Address to wait at."""
     backend: Suppress[Backend | None] = None

@@ -19,8 +19,8 @@ class View(EnvFlags, MavlinkFlags):
     """
 
     what: Positional[str]
-    """Checkpoint, folder of a training, pid, geometric, raptor, FILE.py:CLASS of a controller,
-    random, or a journal (.mcap)."""
+    """Checkpoint, folder of a training, universal, pid, geometric, raptor, FILE.py:CLASS of a
+    controller, random, or a journal (.mcap)."""
     speed: float = 1.0
     """1 is real time, from 1/16 to 8."""
     episodes: Count | None = None

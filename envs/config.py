@@ -150,7 +150,8 @@ class EnvConfig:
             defaults |= {name: getattr(task, name) for name in _FROM_TASK}
             defaults |= task.defaults
         if any(map(is_pool, words_of("vehicle", self.vehicle))):
-            defaults |= _OF_POOLS
+            fits = task is None or "wrench" in task.actions
+            defaults |= _OF_POOLS if fits else {"backend": _OF_POOLS["backend"]}
         missing = [name for name in defaults if getattr(self, name) in (None, ())]
         set_fields(self, **{name: defaults[name] for name in missing})
         set_fields(

@@ -11,8 +11,9 @@ import numpy as np
 from ..models.errors import InputError
 from ..sim.control import CollectiveThrust, RotorThrust, make_controller
 from ..sim.control.cascade import Attitude, Position, Rates, Velocity, tilt_of
+from ..sim.control.wrench import Wrench
 from ..sim.rotations import axes_of
-from ..sim.state import Array, WorldState, clip, stack
+from ..sim.state import Array, WorldState, clip, parts_of, stack
 from .tasks.task import Task
 
 Measure = Literal["hover", "land", "off"]
@@ -30,8 +31,9 @@ class Failsafe:
 
     def __init__(self, task: Task, measure: Measure) -> None:
         self._controller = controller = task.controller
-        vehicle = task.vehicle
-        if not isinstance(controller, RotorThrust | CollectiveThrust | Rates):
+        self._vehicle = vehicle = task.vehicle
+        known = isinstance(controller, RotorThrust | CollectiveThrust | Rates | Wrench)
+        if not known or hasattr(vehicle, "table"):
             raise InputError(
                 "failsafe: expected actions of a level, and drones of one vehicle, "
                 f"got {type(controller).__name__} of {vehicle.name}"
@@ -62,6 +64,11 @@ class Failsafe:
             return controller.action(pilot.turn(collective, rates, state))
         if isinstance(controller, CollectiveThrust):
             return controller.action(collective, state)
+        if isinstance(controller, Wrench):
+            share = collective / self._vehicle.mass - self._vehicle.gravity
+            loops = zip(pilot.gains.rate, rates, parts_of(state.body_rates), strict=True)
+            turns = [gain * (wanted - now) for gain, wanted, now in loops]
+            return clip(stack([share, *turns]) / controller.constants["action_scale"], -1.0, 1.0)
         assert isinstance(controller, Rates)
         asked = [controller.collective.share(collective), *rates]
         if isinstance(controller, Velocity):

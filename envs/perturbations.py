@@ -13,6 +13,8 @@ from .spec import Values
 
 PERTURBATIONS = read_own_toml(__file__, "perturbations")
 """Tables by name."""
+_OF_ONE_CRAFT = ("lag", "lag_low", "lag_high", "way", "kg", "impulse")
+"""Numbers of a size that are those of one vehicle."""
 
 
 def perturbed(config: EnvConfig, name: str, size: float) -> tuple[EnvConfig, Values]:
@@ -21,7 +23,11 @@ def perturbed(config: EnvConfig, name: str, size: float) -> tuple[EnvConfig, Val
     Raises `InputError` for an env that cannot have it.
     """
     table = PERTURBATIONS[name]
-    config.load_vehicle().coefficients.need(table.get("needs", ""), name)
+    vehicle = config.load_vehicle()
+    vehicle.coefficients.need(table.get("needs", ""), name)
+    own = [size for size in _OF_ONE_CRAFT if f"{{{size}}}" in str(table)]
+    if own and hasattr(vehicle, "table"):
+        raise InputError(f"{name}: expected one craft, as drawn:7, got the pool {vehicle.name}")
     numbers = _numbers(config, table, size)
     changes: Values = {}
     for field in ("effects", "sensors", "events", "task"):

@@ -9,10 +9,11 @@ import numpy as np
 from ..envs.autoreset import AdvancingVectorEnv
 from ..envs.failsafe import Failsafe, state_of
 from ..envs.tasks.task import Task
+from ..models.errors import InputError
 from ..models.fields import Limits, check
 from ..models.files import read_own_toml
 from ..rendering.live import Pace
-from ..sim import Array, make_controller
+from ..sim import Array, Wrench, make_controller
 from ..sim.control import RotorThrust
 from .stick_page import StickPage
 
@@ -32,7 +33,7 @@ class HandPilot:
     At the level `rotors` the sticks set collective thrust and body rates, which our rate loop
     mixes.
 
-    Raises `InputError` for drones that `Failsafe` refuses.
+    Raises `InputError` for drones that `Failsafe` refuses, and for the level `wrench`.
 
     Attributes:
         silence: Time since the last sticks, s.
@@ -45,6 +46,8 @@ class HandPilot:
         self._failsafes = {"hover": Failsafe(task, "hover"), "land": Failsafe(task, "land")}
         self._controller = controller = task.controller
         names = controller.components
+        if isinstance(controller, Wrench):
+            raise InputError("teleop: expected a level that sticks command, as rates, got wrench")
         if isinstance(controller, RotorThrust):
             period = task.control_period
             self._mixer = make_controller("rates", task.vehicle, period, task.config.effects)

@@ -216,6 +216,12 @@ time_constant = {craft.lag[0]}
     return file
 
 
+def remove_files() -> None:
+    """Remove the files of drawn craft, in a process that ends without Python's own end."""
+    if _folder.cache_info().currsize:
+        _folder().cleanup()
+
+
 @cache
 def _folder() -> TemporaryDirectory[str]:
     """Of the files, as long as this process needs them."""

@@ -2,6 +2,7 @@
 
 import copy
 import math
+import os
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from functools import lru_cache, partial
@@ -11,7 +12,7 @@ from typing import Any, Self
 
 import numpy as np
 
-from .drawn import columns, drawn_craft, middle_file, range_of, table_of
+from .drawn import SLOTS, columns, drawn_craft, middle_file, range_of, table_of
 from .errors import InputError
 from .library import is_pool, words_of
 from .vehicle import Vehicle
@@ -99,7 +100,7 @@ def load_pool(word: str, linear_drag: float = 0.0) -> Pool:
     digest = blake2b(table.tobytes() + base.hash.encode(), digest_size=16)
     values: dict[str, Any] = {one.name: getattr(base, one.name) for one in fields(Vehicle)}
     shares = columns(table)
-    values["thrust_high"] = (shares["highest"] * shares["share"]).max(axis=0)
+    values["thrust_high"] = np.full(SLOTS, (shares["highest"] * shares["share"]).max())
     values |= {"name": f"drawn:{numbers[0]}-{numbers[-1]}", "hash": digest.hexdigest()}
     return Pool(**values, numbers=numbers, table=table)
 
@@ -137,7 +138,7 @@ def load_vehicles(
 
 def _loaded(name: str | None, linear_drag: float) -> Vehicle:
     """One vehicle, or a `Pool` of drawn craft."""
-    if name and is_pool(name):
+    if name and is_pool(name) and not os.path.isfile(name):
         return load_pool(name, linear_drag)
     return Vehicle.load(name, linear_drag=linear_drag)
 

@@ -57,7 +57,7 @@ def find_vehicle(vehicle: Path | str | None) -> Path:
     if vehicle is None:
         return QUAD_XML.resolve()
     word = str(vehicle)
-    if is_drawn(word):
+    if is_drawn(word) and not os.path.isfile(word):
         from .drawn import drawn_file  # it imports MuJoCo
 
         return drawn_file(word)

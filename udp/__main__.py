@@ -15,6 +15,7 @@ from typing import Any
 
 from ..envs import registry
 from ..envs.config import EnvConfig
+from ..models.drawn import remove_files
 from ..models.errors import InputError, MissingPackage, NoOpenGL
 from ..models.fields import mapping
 from .protocol.client import LinkConfig
@@ -64,4 +65,6 @@ def read_arguments(line: bytes) -> tuple[EnvConfig, dict[str, Any]]:
 
 
 if __name__ == "__main__":
-    os._exit(main())  # all is closed; Python takes a tenth of a second to free what it has
+    status = main()
+    remove_files()
+    os._exit(status)  # all is closed; Python takes a tenth of a second to free what it has

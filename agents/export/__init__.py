@@ -13,6 +13,7 @@ import numpy as np
 
 from ...envs.config import EnvConfig
 from ...models.errors import InputError, require
+from ...models.library import is_pool
 from ..checkpoints import Checkpoint
 from ..layers import Layer
 from ..policies import NetworkPolicy, flat_size
@@ -84,8 +85,9 @@ def metadata(checkpoint: Checkpoint) -> dict[str, str]:
         "inputs": flat_size(spec),
         **{name: fields[name] for name in _SPEC},
     }
-    if checkpoint.env and len(checkpoint.env.vehicle) < 2:
-        facts["rotors"] = rotors_of(checkpoint.env)
+    env = checkpoint.env
+    if env and len(env.vehicle) < 2 and not any(map(is_pool, env.vehicle)):
+        facts["rotors"] = rotors_of(env)
     return {
         name: value if isinstance(value, str) else json.dumps(value, ensure_ascii=False)
         for name, value in facts.items()

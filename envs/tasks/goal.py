@@ -44,7 +44,7 @@ COURSE_WORST_STEP = -COURSE_TIME_COST + COURSE_WORST_RATES
 LEAST_TILT_COSINE = 0.0
 """Cosine of the tilt (90°) past which the craft counts as flipped over."""
 SHIFT = ("goal_x", "goal_y", "goal_z")  # parameters of events that move a goal
-BODY_ACTIONS = ("rotors", "rates")  # Those that act in the body frame
+BODY_ACTIONS = ("rotors", "wrench", "rates")  # Those that act in the body frame
 AIR = 0.6  # Least room under a craft that starts, m
 FURTHEST = 1e4  # Furthest goal, m
 MAX_SPEED = 100.0  # Speed past which an observation is clipped, m/s
@@ -104,7 +104,7 @@ class FramedOptions(TaskOptions):
 
     frame: Frame | None = None
     """Frame of the observation; by default that in which the action acts: `body` with the actions
-    `rotors` and `rates`, `world` with the others."""
+    `rotors`, `wrench` and `rates`, `world` with the others."""
 
 
 class NumbersTask(Task):

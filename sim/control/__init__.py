@@ -13,11 +13,11 @@ from ... import models
 from ...models.errors import InputError, shortened
 from ..effects import NO_EFFECTS, EffectOptions
 from ..state import Array, WorldState, clip, stack, total
-from .cascade import AroundHover, Attitude, Numbers, Position, Rates, Velocity
+from .cascade import AroundHover, Attitude, Mixing, Numbers, Position, Rates, Velocity
 from .gains import Gains, shared_ranges
 from .wrench import Wrench
 
-_CASCADE: dict[str, type[Rates]] = {
+_CASCADE: dict[str, type[Mixing]] = {
     "wrench": Wrench,
     "rates": Rates,
     "attitude": Attitude,

@@ -62,20 +62,18 @@ class AroundHover:
         return over / np.where(over > 0.0, self._up, self._down)
 
 
-class Rates:
-    """Collective thrust and body rates.
+class Mixing:
+    """What levels share whose loops mix thrusts: a vehicle's numbers, and rotors that are driven.
 
-    The rate loop: torque = J kᵣ (wanted rates - rates) + rates × J rates. The mixing: torques of
-    roll and pitch come first, scaled down alike where they span more than the rotors' range; then
-    the collective thrust moves as little as makes room for them; yaw gets the room that is left.
+    An action has four numbers, which `sizes` scales.
     """
 
     every_step = True
     choices = 0
     low: Numbers = (-1.0,) * 4
     high: Numbers = (1.0,) * 4
-    components: tuple[str, ...] = ("collective thrust", "roll rate", "pitch rate", "yaw rate")
-    units: tuple[str, ...] = ("1", "rad/s", "rad/s", "rad/s")
+    components: tuple[str, ...]
+    units: tuple[str, ...]
     frame = "body"
 
     def __init__(self, vehicle: "models.Vehicle", gains: Gains, effects: EffectOptions) -> None:
@@ -84,8 +82,6 @@ class Rates:
         self.constants: dict[str, float | Numbers] = {"action_scale": self._sizes}
         self._mass = vehicle.mass
         self._gravity = vehicle.gravity
-        hover = vehicle.mass * vehicle.gravity
-        self.collective = AroundHover(gains.lowest, hover, gains.highest)
         self._inertia = vehicle.inertia.tolist()
         self._low = vehicle.thrust_low.tolist()
         self._high = vehicle.thrust_high.tolist()
@@ -93,6 +89,53 @@ class Rates:
         if effects.thrust_curve:
             (curve,) = vehicle.coefficients.need("rotors.curve", "thrust_curve")
             self._throttle = _throttle(curve)
+
+    def sizes(self, gains: Gains) -> Numbers:
+        """Values of actions of 1."""
+        raise NotImplementedError
+
+    def thrust(self, action: Array, state: WorldState) -> Array:
+        """As `Controller.thrust`."""
+        raise NotImplementedError
+
+    def _driven(
+        self, wanted: list[Array], state: WorldState, lead: Array, most: Sequence[Array]
+    ) -> Array:
+        """Commands, at most so many newtons, that make rotors with a lag and a thrust curve give
+        these thrusts.
+        """
+        if not isinstance(lead, float) or lead != 1.0:
+            now = parts_of(state.thrust)
+            wanted = [old + lead * (new - old) for old, new in zip(now, wanted, strict=True)]
+        commands = list(map(clip, wanted, self._low, most))
+        table = self._throttle
+        if table is not None:
+            both = zip(commands, self._high, strict=True)
+            commands = [
+                high * interpolated(table, _STEPS * square_root(part / high)) for part, high in both
+            ]
+        return stack(commands)
+
+    def _scaled(self, action: Array) -> list[Array]:
+        pairs = zip(parts_of(action), self._sizes, strict=True)
+        return [size * clip(part, -1.0, 1.0) for part, size in pairs]
+
+
+class Rates(Mixing):
+    """Collective thrust and body rates.
+
+    The rate loop: torque = J kᵣ (wanted rates - rates) + rates × J rates. The mixing: torques of
+    roll and pitch come first, scaled down alike where they span more than the rotors' range; then
+    the collective thrust moves as little as makes room for them; yaw gets the room that is left.
+    """
+
+    components: tuple[str, ...] = ("collective thrust", "roll rate", "pitch rate", "yaw rate")
+    units: tuple[str, ...] = ("1", "rad/s", "rad/s", "rad/s")
+
+    def __init__(self, vehicle: "models.Vehicle", gains: Gains, effects: EffectOptions) -> None:
+        super().__init__(vehicle, gains, effects)
+        hover = vehicle.mass * vehicle.gravity
+        self.collective = AroundHover(gains.lowest, hover, gains.highest)
 
     def sizes(self, gains: Gains) -> Numbers:
         """Values of actions of 1; that of a collective thrust is 1, which is its limit."""
@@ -119,28 +162,6 @@ class Rates:
         gains = self.gains
         thrusts = mixed(gains, collective, torque)
         return self._driven(thrusts, state, gains.lead, self._high)
-
-    def _driven(
-        self, wanted: list[Array], state: WorldState, lead: Array, most: Sequence[Array]
-    ) -> Array:
-        """Commands, at most so many newtons, that make rotors with a lag and a thrust curve give
-        these thrusts.
-        """
-        if not isinstance(lead, float) or lead != 1.0:
-            now = parts_of(state.thrust)
-            wanted = [old + lead * (new - old) for old, new in zip(now, wanted, strict=True)]
-        commands = list(map(clip, wanted, self._low, most))
-        table = self._throttle
-        if table is not None:
-            both = zip(commands, self._high, strict=True)
-            commands = [
-                high * interpolated(table, _STEPS * square_root(part / high)) for part, high in both
-            ]
-        return stack(commands)
-
-    def _scaled(self, action: Array) -> list[Array]:
-        pairs = zip(parts_of(action), self._sizes, strict=True)
-        return [size * clip(part, -1.0, 1.0) for part, size in pairs]
 
 
 class Attitude(Rates):

@@ -58,6 +58,8 @@ class Gains:
     """kᵥ: acceleration per error of the velocity, 1/s."""
     position: float
     """kₚ: velocity per error of the position, 1/s."""
+    period: float
+    """Time between two looks at the state, s."""
     lag: float
     """Time constant of the rotors, s."""
     lead: float
@@ -125,6 +127,7 @@ class Gains:
             heading=yaw,
             velocity=p / 2,
             position=p / 5,
+            period=period,
             lag=lag,
             lead=lead_of(lag, period) if lag > 0 else 1.0,
             most_rate=tuple(np.sqrt(math.pi * alpha).tolist()),

@@ -14,7 +14,7 @@ from ...models.drawn import columns
 from ...models.matrices import inverse, times
 from ..effects import EffectOptions
 from ..state import Array, WorldState, clip, parts_of, total
-from .cascade import Numbers, Rates, mixed
+from .cascade import Mixing, Numbers, mixed
 from .gains import Gains, lead_of
 
 SIZES = (20.0, 150.0, 150.0, 30.0)
@@ -49,14 +49,14 @@ class Plant(NamedTuple):
     """s."""
 
 
-class Wrench(Rates):
+class Wrench(Mixing):
     """Acceleration along body z, and angular accelerations about the body's axes.
 
     Torque = J · angular acceleration; thrusts are mixed, and rotors driven, as those of `Rates`.
     """
 
-    components = _ACTIONS
-    units = ("m/s²", "rad/s²", "rad/s²", "rad/s²")
+    components: tuple[str, ...] = _ACTIONS
+    units: tuple[str, ...] = ("m/s²", "rad/s²", "rad/s²", "rad/s²")
 
     def __init__(self, vehicle: "models.Vehicle", gains: Gains, effects: EffectOptions) -> None:
         super().__init__(vehicle, gains, effects)
@@ -73,7 +73,7 @@ class Wrench(Rates):
             most=self._high,
             lag=gains.lag,
         )
-        self._period = vehicle.timestep if effects.motor_lag else 0.0
+        self._period = gains.period if effects.motor_lag else 0.0
 
     def sizes(self, gains: Gains) -> Numbers:
         """See `SIZES`."""

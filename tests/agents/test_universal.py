@@ -9,6 +9,7 @@ from rotorgram.cli import main
 from rotorgram.cli._env import UNIVERSAL, checkpoint_file
 from rotorgram.envs import LocalVectorEnv
 from rotorgram.flights.crowd import Columns, fly_crowd
+from rotorgram.models import InputError
 from rotorgram.models.library import vehicle_names
 
 HOVER = "rotorgram/Hover-v0"
@@ -52,6 +53,17 @@ def test_it_flies_a_file_of_one_s_own_by_its_name(
     assert main(["vehicle", "new", str(file)]) == 0
     assert main(["evaluate", "universal", "--vehicle", str(file), "--episodes", "2"]) == 0
     assert "2, 0 terminated" in capsys.readouterr().out
+
+
+def test_it_refuses_numbers_that_mean_something_else() -> None:
+    for options, sentence in (
+        ({"frame": "world"}, "expected observation with the frame 'body', on which it was trained"),
+        ({"frame": "body", "action": "rates"}, "expected weights of shapes"),
+    ):
+        given = {"action": "wrench", **options}
+        env = LocalVectorEnv(HOVER, 1, autoreset_mode="Disabled", vehicle="hummingbird", **given)
+        with pytest.raises(InputError, match=sentence):
+            load(UNIVERSAL).policy(env.env_spec)
 
 
 def test_a_folder_of_that_name_is_the_user_s(

@@ -88,10 +88,17 @@ def test_a_drawn_craft_is_a_file_like_any_other() -> None:
         assert vehicle.coefficients["rotors.time_constant"] == row["lag"][0]
 
 
-@pytest.mark.parametrize("effects", [{}, {"motor_lag": True}], ids=["ideal", "lag"])
-def test_a_pool_flies_each_craft_as_it_flies_alone(effects: dict[str, bool]) -> None:
+ESTIMATE = {"imu": True, "motion_capture": True, "estimate": True, "observe": "estimate"}
+
+
+@pytest.mark.parametrize(
+    "flight",
+    [{}, {"effects": {"motor_lag": True}}, {"effects": {"motor_lag": True}, "sensors": ESTIMATE}],
+    ids=["ideal", "lag", "estimate"],
+)
+def test_a_pool_flies_each_craft_as_it_flies_alone(flight: dict[str, Any]) -> None:
     """Other worlds have other craft, and a craft of 1 kg flies like its own file's."""
-    env, together = flown("drawn:0-99", 6, effects=effects)
+    env, together = flown("drawn:0-99", 6, **flight)
     rows = table_of(drawn_craft(range(100)))
     found = [
         int(np.flatnonzero((rows == row).all(axis=1))[0])
@@ -100,7 +107,7 @@ def test_a_pool_flies_each_craft_as_it_flies_alone(effects: dict[str, bool]) -> 
     assert len(set(found)) > 3
     seen = env.observations
     for world, number in enumerate(found):
-        given = {**FREE, "goal": HIGH, "dtype": "float64", "effects": effects}
+        given = {**FREE, "goal": HIGH, "dtype": "float64", **flight}
         alone = LocalVectorEnv(
             HOVER, 1, autoreset_mode="Disabled", vehicle=f"drawn:{number}", **given
         )
@@ -186,6 +193,7 @@ def test_a_pool_stands_alone() -> None:
         load_vehicles("hummingbird,drawn", 2)
     with pytest.raises(InputError, match="expected one craft, as drawn:3, got drawn:3-4"):
         Vehicle.load("drawn:3-4")
+    flown("drawn:3-4", 2, steps=1)  # four rotors both
     pool = load_vehicles("drawn:3-4", 2)
     assert isinstance(pool, Pool)
     assert pool.numbers == range(3, 5)
