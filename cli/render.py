@@ -28,7 +28,8 @@ class Render(EnvFlags):
 
     what: Positional[Annotated[Words, OneOrMore()]]
     """Checkpoint, folder of a training, universal, pid, geometric, raptor, FILE.py:CLASS of a
-    controller, random, or a journal (.mcap). Policies fly evaluation episodes without exploration."""
+    controller, random, or a journal (.mcap). Policies fly evaluation episodes without
+    exploration."""
     out: Path
     """film.mp4, picture.png, or a folder for pictures 0001.png and so on. It must not
     exist."""

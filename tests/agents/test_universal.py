@@ -58,7 +58,7 @@ def test_it_flies_a_file_of_one_s_own_by_its_name(
 def test_it_refuses_numbers_that_mean_something_else() -> None:
     for options, sentence in (
         ({"frame": "world"}, "expected observation with the frame 'body', on which it was trained"),
-        ({"frame": "body", "action": "rates"}, "expected weights of shapes"),
+        ({"frame": "body", "action": "rates"}, "expected action with the components ..lift.*, got"),
     ):
         given = {"action": "wrench", **options}
         env = LocalVectorEnv(HOVER, 1, autoreset_mode="Disabled", vehicle="hummingbird", **given)

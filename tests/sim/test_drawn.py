@@ -88,7 +88,13 @@ def test_a_drawn_craft_is_a_file_like_any_other() -> None:
         assert vehicle.coefficients["rotors.time_constant"] == row["lag"][0]
 
 
-ESTIMATE = {"imu": True, "motion_capture": True, "estimate": True, "observe": "estimate"}
+IMU = {f"{what}_{kind}": 1e-9 for what in ("gyro", "accelerometer") for kind in ("noise", "walk")}
+ESTIMATE: dict[str, Any] = {
+    "imu": {**IMU, "gyro_bias": 0.0, "accelerometer_bias": 0.0},
+    "motion_capture": {"noise": 1e-9, "angle_noise": 1e-9},
+    "estimate": True,
+    "observe": "estimate",
+}
 
 
 @pytest.mark.parametrize(
