@@ -154,7 +154,9 @@ def table_of(craft: Craft) -> np.ndarray:
     yaw = craft.turn * craft.reaction[:, None]
     there = abs(craft.turn)
     count = there.sum(axis=1, keepdims=True)
-    xx, xy, yy = ((a * b).sum(axis=1, keepdims=True) for a, b in ((x, x), (x, y), (y, y)))
+    xx = (x * x).sum(axis=1, keepdims=True)
+    xy = (x * y).sum(axis=1, keepdims=True)
+    yy = (y * y).sum(axis=1, keepdims=True)
     size = count / (xx * yy - xy * xy)
     # The least thrusts of a torque: rotors are point symmetric and turn by turns, so that those
     # of yaw and of the collective thrust are orthogonal to each other and to roll and pitch.

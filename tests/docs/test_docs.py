@@ -3,6 +3,7 @@
 import json
 import re
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import pandas as pd
@@ -296,24 +297,15 @@ def test_the_table_of_laps_has_what_was_flown() -> None:
     check("tasks", *rows)
 
 
+@pytest.mark.parametrize(("name", "study"), [("robust", robust), ("universal", universal)])
 def test_the_page_of_robust_policies_has_what_every_flight_says(
-    monkeypatch: pytest.MonkeyPatch,
+    name: str, study: ModuleType, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(RESULTS.parent.parent)
-    found = robust.sums()
-    committed = result("robust")
-    assert {vehicle: committed[vehicle] for vehicle in found} == found
-    check("robustness", *(" ".join(row.split()) for row in robust.page(found).splitlines()))
-
-
-def test_the_page_of_the_universal_policy_has_what_every_flight_says(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.chdir(RESULTS.parent.parent)
-    found = universal.sums()
-    committed = result("universal")
-    assert {name: committed[name] for name in found} == found
-    check("robustness", *(" ".join(row.split()) for row in universal.page(found).splitlines()))
+    found = study.sums()
+    committed = result(name)
+    assert {key: committed[key] for key in found} == found
+    check("robustness", *(" ".join(row.split()) for row in study.page(found).splitlines()))
 
 
 def crashes_of(found: dict[str, Any]) -> str:
