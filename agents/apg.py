@@ -1,7 +1,8 @@
 """Analytic policy gradients: the derivative of the reward itself, through the physics.
 
-Back-propagation through time, as in Wiedemann et al., ICRA 2023, arXiv 2209.13052, without a value
-function. It needs the derivative of the env's step, which compiled code in this process has.
+Back-propagation through time: without a value function as in Wiedemann et al., ICRA 2023, arXiv
+2209.13052, and with one as in Xu et al., ICLR 2022, arXiv 2204.07137. It needs the derivative of
+the env's step, which compiled code in this process has.
 """
 
 import numpy as np
@@ -9,12 +10,13 @@ import numpy as np
 from ..envs.compiled import CompiledLoop
 from ..models.errors import InputError
 from ..models.fields import PositiveInt, immutable
-from .config import Config, Positive
+from .config import Config, Positive, Share
 from .episodes import EpisodeRecorder
-from .layers import Floats
+from .layers import Floats, Weights, named
 from .learner import Learner
-from .optimizers import clip_norm
-from .rollouts import Collector, Rollout
+from .networks import make_network
+from .optimizers import Adam, clip_norm
+from .rollouts import Collector, Numbers, Rollout, advantages
 
 
 @immutable
@@ -25,6 +27,10 @@ class APGConfig(Config):
     """Steps of each drone in an update, through which it differentiates."""
     max_grad_norm: Positive = 1.0
     """The gradient, as one vector, is scaled down to this length."""
+    most_of_one: Positive | None = None
+    """The derivatives by the actions of one drone are scaled down to this many times the median of
+    all drones, for those of a craft that is hard to hold grow with every step; null: not.
+    """
 
     remembers = False
 
@@ -45,8 +51,8 @@ class APG(Learner):
         machine = loop.machine() if isinstance(loop, CompiledLoop) else None
         if machine is None or not machine.is_whole or log.actions.discrete:
             raise InputError(
-                "apg: expected continuous actions and an env that is compiled, in this process "
-                "(--backend rigid --no-udp), got another one"
+                f"{type(self).__name__.lower()}: expected continuous actions and an env that is "
+                "compiled, in this process (--backend rigid --no-udp), got another one"
             )
         self._drones = log.num_envs
         self._machine = machine
@@ -84,16 +90,114 @@ class APG(Learner):
         ended = np.asarray(worlds.all(axis=2))
         ended[-1] = True
         slopes = np.zeros_like(rollout.actions)
-        by_observations = np.zeros((self._drones, network.inputs), np.float32)
+        by_observations = self.beyond(rollout)
         for step in reversed(range(steps)):
             drawn = rollout.actions[step]
             sent = actions.to_envs(drawn)
             slope = self._derivative.back(
-                self._tape[step], sent, by_rewards[step], by_observations, ended[step]
+                self._tape[step], sent, by_rewards[step], by_observations[step], ended[step]
             )
             slope *= actions.half
             slope[sent != actions.middle + actions.half * drawn] = 0.0  # it was clipped
             slopes[step] = slope
-            network.forward(rollout.observations[step].T)
-            by_observations = network.back(slope.T).T
+            if step:
+                network.forward(rollout.observations[step].T)
+                goes_on = ~rollout.ends[step - 1, :, np.newaxis]
+                by_observations[step - 1] += goes_on * network.back(slope.T).T
+        if config.most_of_one:
+            sizes = np.sqrt(np.square(slopes).sum(axis=(0, 2)))
+            most = config.most_of_one * np.median(sizes)
+            slopes *= (most / np.maximum(sizes, most))[:, np.newaxis]
         return slopes
+
+    def beyond(self, rollout: Rollout) -> Floats:
+        """Derivatives of the loss of what follows the rollout, by what an actor observes after each
+        step, (T, N, n).
+        """
+        steps, drones = rollout.kept.shape
+        return np.zeros((steps, drones, self._actor.network.inputs), np.float32)
+
+
+@immutable
+class SHACConfig(APGConfig):
+    """Short-horizon actor-critic (Xu et al. 2022). Defaults: where it says so, the paper's."""
+
+    horizon: int = 32
+    """Steps of each drone in an update, through which it differentiates (appendix A.2.2)."""
+    gae_lambda: Share = 0.95
+    """Lambda of the values that the critic learns (appendix A.2.2)."""
+    critic_learning_rate: Positive | None = None
+    """Of the critic's weights; null: the same."""
+    epochs: PositiveInt = 2
+    """Passes of the critic over a rollout."""
+    minibatches: PositiveInt = 4
+    """Parts of a rollout, each for one step of the critic (appendix A.2.2)."""
+
+
+class SHAC(APG):
+    """Short-horizon actor-critic: a flight that goes on counts with its value, Equation 5.
+
+    The critic descends the squared error to TD(λ), Equation 7, after the actor's step. Not as in
+    the paper: it has no target network, Adam has its usual constants, and an episode may end at any
+    step of a rollout.
+    """
+
+    config: SHACConfig
+
+    def __init__(self, log: EpisodeRecorder, config: SHACConfig, seed: int) -> None:
+        super().__init__(log, config, seed)
+        self._critic = make_network(self.spec.observation, 1, config)
+        self._judge = Weights.zeros(self._critic.shapes)
+        self._critic.bind(self._judge)
+        self._critic.initialise(self._rng, 1.0)
+        self._adam = Adam(self._judge, self.epsilon)
+        self._arrays["critic"] = self._judge.values
+        self._arrays |= named("critic.optimizer.", self._adam.state)
+
+    def gradient(self, rollout: Rollout) -> None:
+        """That of APG, with values; then the critic learns."""
+        super().gradient(rollout)
+        config = self.config
+        values = self._values(rollout.observations)
+        found = advantages(
+            rollout.rewards,
+            values,
+            self._values(rollout.next_observations),
+            rollout.terminated,
+            rollout.truncated,
+            gamma=config.gamma,
+            gae_lambda=config.gae_lambda,
+        )
+        seen = rollout.rows(rollout.observations)
+        targets = rollout.rows((values + found).astype(np.float32))
+        self.terms |= {"values": rollout.rows(values), "targets": targets}
+        rate = self.rate * (config.critic_learning_rate or config.learning_rate)
+        for _ in range(config.epochs):
+            order = self._rng.permutation(len(targets))
+            for chosen in np.array_split(order, min(config.minibatches, len(order))):
+                errors = self._critic.forward(seen[chosen].T) - targets[chosen]
+                self.terms["value_loss"] = np.square(errors).mean()
+                errors *= 2 / len(chosen)
+                self._critic.learn(errors)
+                clip_norm(self._judge.slopes, config.max_grad_norm)
+                self._adam.step(rate / config.learning_rate)
+
+    def beyond(self, rollout: Rollout) -> Floats:
+        """Of the value where a flight goes on, after the last step and after a truncation."""
+        config = self.config
+        after = rollout.next_observations
+        self._values(after)
+        steps, drones = rollout.kept.shape
+        slopes = self._critic.back(np.ones((1, steps * drones), np.float32)).T
+        goes_on = rollout.truncated.copy()
+        goes_on[-1] = True
+        goes_on &= rollout.kept & ~rollout.terminated
+        weights = config.gamma ** np.arange(1, steps + 1) * (-1 / len(rollout))
+        by_after = slopes.reshape(after.shape) * (weights[:, np.newaxis] * goes_on)[..., np.newaxis]
+        return by_after[..., : self._actor.network.inputs].astype(np.float32)
+
+    def _values(self, observations: Floats) -> Numbers:
+        """V of observations (T, N, n), (T, N)."""
+        *lead, size = observations.shape
+        values = self._critic.forward(observations.reshape(-1, size).T)
+        return values.reshape(lead).astype(np.float64)

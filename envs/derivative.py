@@ -57,7 +57,7 @@ class Derivative:
                 continue
             slope: Any = read(program, f"by/{name}", array.dtype, array.shape)
             arrays[f"by/{name}"] = slope
-            if name != "reward":
+            if name not in ("reward", "observation"):
                 slope = np.where(ended, 0.0, slope)
             values = lift(program, array, array.dtype)
             outputs += zip(values, slope.values.flat, strict=True)
@@ -87,8 +87,8 @@ class Derivative:
             sent: The actions, shape (W A, k).
             by_reward: Derivatives by the rewards, shape (W A,).
             by_observation: Those by what an actor observes after the step, flat, shape (W A, n).
-            ended: Whether the loss depends on nothing after the step, bool, shape (W,). Then the
-                derivatives by state and observations do not count.
+            ended: Whether the state after the step leads to nothing more, bool, shape (W,). Then
+                the derivatives by it do not count.
         """
         memory = self._memory
         for name, values in before.scenery.shared.items():

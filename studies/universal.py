@@ -1,9 +1,9 @@
 """One policy for every craft: how it is trained, and what it flies.
 
     python studies/universal.py [--seeds 5] [--first-seed 900] [--flights 1000]
-        [--env-steps 16000000] [--peers 100] [--only-sums]
+        [--env-steps 40000000] [--peers 100] [--only-sums]
 
-Each seed trains by `rotorgram train ppo --config studies/universal.toml`; the clock runs from
+Each seed trains by `rotorgram train shac --config studies/universal.toml`; the clock runs from
 before the process starts to after it has ended. The policy flies craft that no training saw,
 `drawn:100000-104095`, and each craft of the library, with the lag of its rotors where its file has
 one: in Hover-v0, and thrown, in Recovery-v0. `raptor` flies the quadcopters of the library and
@@ -47,16 +47,15 @@ UNSEEN_RANGE = range_of(UNSEEN)
 NAMES = {UNSEEN: "unseen drawn craft", "peers": "drawn quadcopters, ten flights each"}
 CRASHED = 65535
 SETTINGS = (
-    "hidden=[64,64]", "steps_per_update=16384", "learning_rate=0.004",
-    "critic_learning_rate=0.012", "gamma=0.99", "gae_lambda=0.95",
+    "hidden=[64,64]", "activation=tanh", "reach=3", "learning_rate=0.003", "anneal=true",
+    "reward_scale=0.15", "reward_clip=8", "log_std=-3", "most_of_one=30",
 )  # fmt: skip
 STARTS = {"hover": "rotorgram/Hover-v0", "throws": "rotorgram/Recovery-v0"}
 
 
 def trained(seed: int, env_steps: int, folder: Path) -> float:
     """Train; wall time of the process, s."""
-    words = ["train", "ppo", "--config", str(CONFIG), "--preset", "robust", "--set", *SETTINGS]
-    words += ["--preset-of", STARTS["hover"], "--num-envs", "512"]
+    words = ["train", "shac", "--config", str(CONFIG), "--num-envs", "512", "--set", *SETTINGS]
     words += ["--env-steps", str(env_steps), "--seed", str(seed)]
     began = time.perf_counter()
     subprocess.run([sys.executable, "-m", "rotorgram.cli", *words, "--out", str(folder)],
@@ -253,7 +252,7 @@ def _shown(cell: dict[str, Any] | None) -> str:
 
 
 def main() -> None:
-    args = options(__doc__, seeds=5, first_seed=900, flights=1000, env_steps=16_000_000, peers=100,
+    args = options(__doc__, seeds=5, first_seed=900, flights=1000, env_steps=40_000_000, peers=100,
                    only_sums=False).parse_args()  # fmt: skip
     if not args.only_sums:
         measure(args)

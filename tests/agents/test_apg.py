@@ -1,4 +1,4 @@
-"""Analytic policy gradients: the derivative, and that it learns, stops and resumes."""
+"""Analytic policy gradients, and with values: that they learn, stop and resume."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from nets import arrays_of
 from rotorgram.agents import EpisodeRecorder, find_preset, load, make_agent, store
-from rotorgram.agents.apg import APG, APGConfig
+from rotorgram.agents.apg import APG, SHAC, APGConfig, SHACConfig
 from rotorgram.agents.rollouts import Collector, Rollout
 from rotorgram.cli import main
 from rotorgram.envs import LocalVectorEnv, Outcome, register
@@ -37,7 +37,8 @@ def agent_of(
 ) -> tuple[APG, EpisodeRecorder]:
     settings = {"backend": DOUBLE, "autoreset_mode": "Disabled", **options}
     log = EpisodeRecorder(LocalVectorEnv(env_id, drones, **settings), 3)
-    agent = make_agent("apg", log, config or APGConfig(), 3)
+    name = "shac" if isinstance(config, SHACConfig) else "apg"
+    agent = make_agent(name, log, config or APGConfig(), 3)
     assert isinstance(agent, APG)
     return agent, log
 
@@ -114,10 +115,10 @@ def test_through_a_wood_the_gradient_is_that_with_the_depth_held() -> None:
     assert abs(gradient).max() > 1e-3
 
 
-def climbing(steps: int, **options: Any) -> tuple[APG, Rollout]:
+def climbing(steps: int, kind: type[APGConfig] = APGConfig, **options: Any) -> tuple[APG, Rollout]:
     """An agent that gives 0.1 whatever it sees, with as little noise as there may be."""
     register(CLIMB, Climb)
-    config = APGConfig(gamma=0.5, log_std=LEAST)
+    config = kind(gamma=0.5, log_std=LEAST)
     level = {"start_tilt": 0.0, "start_heading": 0.0}
     agent, log = agent_of(CLIMB, 3, config, **level, **options)
     arrays, _ = arrays_of(agent)
@@ -168,9 +169,77 @@ def test_a_clipped_reward_has_no_derivative() -> None:
     assert after[0] == pytest.approx(before[1], rel=1e-2)  # by the second reward alone
 
 
-def test_it_learns() -> None:
+def test_what_one_drone_counts_has_a_bound() -> None:
+    """Two of three drones count with their last reward alone."""
+    agent, rollout = climbing(3)
+    kept = rollout.kept.copy()
+    kept[:-1, [0, 2]] = False
+    part = replace(rollout, kept=kept)
+    free = agent.slopes(part)
+    agent.config = replace(agent.config, most_of_one=2.0)
+    bounded = agent.slopes(part)
+    assert bounded[:, 0].tolist() == free[:, 0].tolist()
+    sizes = np.linalg.norm(free, axis=(0, 2))
+    assert sizes[1] > 4 * sizes[0]
+    assert bounded[:, 1] == pytest.approx(free[:, 1] * (2 * sizes[0] / sizes[1]), rel=1e-4)
+
+
+def valued(steps: int, **options: Any) -> tuple[SHAC, Rollout]:
+    """As `climbing`, and V(s) is 3 s/m times the speed upwards plus 6."""
+    agent, rollout = climbing(steps, SHACConfig, **options)
+    assert isinstance(agent, SHAC)
+    judge = agent._judge.arrays
+    for array in judge.values():
+        array[...] = 0.0
+    judge["layers.0.weight"][0, [0, 6]] = (2.0, 1.0)  # the bias, and the sixth number
+    judge["layers.1.weight"][0, 1] = 3.0
+    return agent, rollout
+
+
+def test_a_flight_that_goes_on_counts_with_its_value() -> None:
+    agent, rollout = valued(3)
+    shares = np.array([1 + 0.5 + 0.25, 0.5 + 0.25, 0.25]) + 0.125 * 3
+    expected = -0.051 / 9 * shares[:, None, None] * np.ones((3, 3, 4))
+    assert agent.slopes(rollout) == pytest.approx(expected, rel=1e-2)
+
+
+def test_so_does_an_episode_that_was_cut_off_and_no_crash() -> None:
+    """Two episodes of two steps; then all crash in the last one."""
+    agent, rollout = valued(4, episode_length=2)
+    value = 3 * np.array([0.25, 0.25, 0.0625, 0.0625])
+    shares = np.array([1 + 0.5, 0.5, 0.25 + 0.125, 0.125])
+    expected = -0.051 / 12 * (shares + value)[:, None, None] * np.ones((4, 3, 4))
+    assert agent.slopes(rollout) == pytest.approx(expected, rel=1e-2)
+    terminated = rollout.terminated.copy()
+    terminated[-1] = True
+    crashed = agent.slopes(replace(rollout, terminated=terminated))
+    assert crashed[:2] == pytest.approx(expected[:2], rel=1e-2)
+    expected = -0.051 / 12 * shares[2:, None, None] * np.ones((2, 3, 4))
+    assert crashed[2:] == pytest.approx(expected, rel=1e-2)
+
+
+def test_the_critic_learns_the_sum_of_what_follows() -> None:
+    """With λ = 1: the discounted rewards of the rollout and the value after it."""
+    agent, rollout = valued(4)
+    agent.config = replace(agent.config, gae_lambda=1.0)
+    last = 3 * (rollout.next_observations[-1, :, 5] + 2)
+    sums = [last]
+    for rewards in rollout.rewards[::-1]:
+        sums.append(rewards + 0.5 * sums[-1])
+    losses = []
+    for _ in range(40):
+        agent.gradient(rollout)
+        losses.append(agent.terms["value_loss"])
+        if len(losses) == 1:
+            expected = np.concatenate(sums[:0:-1])
+            assert agent.terms["targets"] == pytest.approx(expected, rel=1e-4)
+    assert losses[-1] < 0.5 * losses[0]
+
+
+@pytest.mark.parametrize("kind", [APGConfig, SHACConfig])
+def test_it_learns(kind: type[APGConfig]) -> None:
     gains = []
-    config = APGConfig(hidden=(16,), activation="tanh", learning_rate=0.02)
+    config = kind(hidden=(16,), activation="tanh", learning_rate=0.02, horizon=80)
     agent, log = agent_of(drones=16, config=config)
 
     def keep() -> bool:
@@ -181,11 +250,12 @@ def test_it_learns() -> None:
     assert np.mean(gains[-4:]) > np.mean(gains[:4]) + 1.0
 
 
-def test_it_resumes_to_the_bit(tmp_path: Path) -> None:
-    config = APGConfig(horizon=10, hidden=(8,))
+@pytest.mark.parametrize(("name", "kind"), [("apg", APGConfig), ("shac", SHACConfig)])
+def test_it_resumes_to_the_bit(name: str, kind: type[APGConfig], tmp_path: Path) -> None:
+    config = kind(horizon=10, hidden=(8,))
     options: dict[str, Any] = {"backend": "rigid", "episode_length": 25}
     env = EnvConfig.from_keywords(HOVER, **options)
-    run = Run(env=env, algorithm="apg", config=config, seed=1, env_steps=320, num_envs=8)
+    run = Run(env=env, algorithm=name, config=config, seed=1, env_steps=320, num_envs=8)
 
     def vector() -> LocalVectorEnv:
         return LocalVectorEnv(HOVER, 8, autoreset_mode="Disabled", **options)
@@ -198,8 +268,8 @@ def test_it_resumes_to_the_bit(tmp_path: Path) -> None:
     store(part.checkpoint(), tmp_path / "kept")
     rest = Training.resume(load(tmp_path / "kept"), vector())
     assert rest.train()
-    for name, array in whole.agent.state().items():
-        assert rest.agent.state()[name].tobytes() == array.tobytes(), name
+    for part_of, array in whole.agent.state().items():
+        assert rest.agent.state()[part_of].tobytes() == array.tobytes(), part_of
 
 
 @pytest.mark.parametrize(
