@@ -29,7 +29,8 @@ class APGConfig(Config):
     """The gradient, as one vector, is scaled down to this length."""
     most_of_one: Positive | None = None
     """The derivatives by the actions of one drone are scaled down to this many times the median of
-    all drones, for those of a craft that is hard to hold grow with every step; null: not.
+    all drones, for those of a craft that is hard to hold grow with every step; what is no number
+    counts as 0. Null: neither.
     """
 
     remembers = False
@@ -71,10 +72,10 @@ class APG(Learner):
         """Of minus the mean of the discounted rewards."""
         (output,) = outputs = self._both.forward(rollout.rows(rollout.observations).T)
         _, entropy = self._actor.head.score(output, rollout.rows(rollout.actions).T)
+        self.terms = {"gain": rollout.rows(rollout.rewards).mean(), "entropy": entropy}
         output[...] = rollout.rows(self.slopes(rollout)).T
         self._both.learn(outputs)
         clip_norm(self.weights.slopes, self.config.max_grad_norm)
-        self.terms = {"gain": rollout.rows(rollout.rewards).mean(), "entropy": entropy}
 
     def slopes(self, rollout: Rollout) -> Floats:
         """Derivatives of minus the mean of the discounted rewards by drawn actions, (T, N, k)."""
@@ -106,8 +107,10 @@ class APG(Learner):
                 by_observations[step - 1] += goes_on * network.back(slope.T).T
         if config.most_of_one:
             sizes = np.sqrt(np.square(slopes).sum(axis=(0, 2)))
-            most = config.most_of_one * np.median(sizes)
+            most = config.most_of_one * np.nanmedian(sizes)
             slopes *= (most / np.maximum(sizes, most))[:, np.newaxis]
+            slopes[:, ~np.isfinite(sizes)] = 0.0
+            self.terms["bounded"] = np.mean(~(sizes <= most))
         return slopes
 
     def beyond(self, rollout: Rollout) -> Floats:

@@ -16,18 +16,23 @@ class Export(ModuleFlag):
     """Checkpoint, or folder of a training."""
     to: Literal["onnx", "c", "crazyflie"]
     """Kind of file; or a folder that builds to the Crazyflie's firmware with the policy in it."""
+    vehicle: str | None = None
+    """Craft that flies it, of a policy for every craft: a name or a file. Default: that of its
+    training."""
     out: Annotated[Path | None, arg(aliases=["-o"])] = None
     """File or folder to write, a new one. Default: policy.onnx, rotorgram_policy.h or
     crazyflie_policy in the working directory."""
 
     def run(self) -> None:
         """Write it."""
-        from ..agents.export import TARGETS, export
+        from ..agents.export import TARGETS, export, on_vehicle
         from ..agents.export.crazyflie import app
         from ..flights.folders import new_folder
         from ._env import trained
 
         checkpoint = trained(self.policy)
+        if self.vehicle:
+            checkpoint = on_vehicle(checkpoint, self.vehicle)
         if self.to == "crazyflie":
             files = app(checkpoint)
             folder = new_folder(self.out or Path("crazyflie_policy"), "")

@@ -1,12 +1,14 @@
 """What a robust training is worth, and what it costs: crashes and errors under each perturbation.
 
     python studies/robust.py [--vehicles crazyflie2 hummingbird paper] [--seeds 5]
-        [--first-seed 700] [--flights 1000] [--only-sums]
+        [--first-seed 700] [--flights 1000] [--pilots robust tuned geometric universal]
+        [--only-sums]
 
 For each vehicle and seed `rotorgram train ppo --env rotorgram/Hover-v0` trains with the presets
 robust and tuned; the clock runs from before the process starts to after it has ended. Both then fly
-the perturbations for which the first was trained, alone and all together, and so does `geometric`,
-from starts that no training has seen. `docs/results/robust_flights.npz` gets the steady error of
+the perturbations for which the first was trained, alone and all together, and so do `geometric` and
+the policy `universal`, from starts that no training has seen. Flights of pilots that are not named
+stay. `docs/results/robust_flights.npz` gets the steady error of
 every flight in millimetres, 65535 of one that crashed, from which `--only-sums` computes
 `docs/results/robust.json` again.
 
@@ -23,6 +25,7 @@ from typing import Any
 import numpy as np
 from measuring import RESULTS, options, table, write
 from rotorgram.agents import find_preset
+from rotorgram.cli._env import UNIVERSAL
 from rotorgram.envs.config import EnvConfig
 from rotorgram.envs.perturbations import perturbed, together
 from rotorgram.flights.executors import WorkersConfig
@@ -35,7 +38,12 @@ FILE = RESULTS / "robust.json"
 FLIGHTS = RESULTS / "robust_flights.npz"
 CRASHED = 65535
 PRESETS = ("robust", "tuned")
-PILOTS = (*PRESETS, "geometric")
+OPTIONS: dict[str, dict[str, object]] = {
+    "geometric": {"action": "position"},
+    "universal": {"action": "wrench", "frame": "body"},
+}
+"""Of the env, of pilots that need no training."""
+PILOTS = (*PRESETS, *OPTIONS)
 
 
 def cells_of(vehicle: str) -> list[Cell]:
@@ -69,7 +77,8 @@ def trained(vehicle: str, preset: str, seed: int, folder: Path) -> float:
 def flown(pilot: str, cells: list[Cell], flights: int, **options: object) -> np.ndarray:
     """Steady errors of the flights of each cell, mm, uint16, shape (cells, flights)."""
     changed = [Cell(**{**vars(cell), "config": cell.config.changed(**options)}) for cell in cells]
-    rows = fly(jobs_of(pilot, changed, flights), WorkersConfig(), lambda *_: None)
+    file = str(UNIVERSAL) if pilot == "universal" else pilot
+    rows = fly(jobs_of(file, changed, flights), WorkersConfig(), lambda *_: None)
     found = []
     for cell in cells:
         own = rows[(rows["row"] == cell.row) & (rows["size"] == cell.size)]
@@ -81,24 +90,30 @@ def flown(pilot: str, cells: list[Cell], flights: int, **options: object) -> np.
 def measure(args: Any) -> None:
     """Train and fly; write every flight."""
     arrays: dict[str, np.ndarray] = {}
+    if FLIGHTS.is_file():
+        with np.load(FLIGHTS) as kept:
+            arrays.update(kept)
     for vehicle in args.vehicles:
         cells = cells_of(vehicle)
         labels = ["all together" if cell.row == TOGETHER else cell.label for cell in cells]
         arrays[f"{vehicle}/cells"] = np.array(labels)
-        errors = flown("geometric", cells, args.flights, action="position")
-        arrays[f"{vehicle}/geometric"] = errors[None]
-        for preset in PRESETS:
+        for pilot in args.pilots:
+            if pilot in OPTIONS:
+                errors = flown(pilot, cells, args.flights, **OPTIONS[pilot])
+                arrays[f"{vehicle}/{pilot}"] = errors[None]
+                np.savez_compressed(FLIGHTS, **arrays)
+                continue
             seconds = []
             of_seeds = []
             for seed in range(args.first_seed, args.first_seed + args.seeds):
                 with tempfile.TemporaryDirectory() as folder:
                     run = Path(folder) / "run"
-                    seconds.append(trained(vehicle, preset, seed, run))
+                    seconds.append(trained(vehicle, pilot, seed, run))
                     checkpoint = str(run / "checkpoint.safetensors")
                     of_seeds.append(flown(checkpoint, cells, args.flights))
-                print(vehicle, preset, seed, seconds[-1], flush=True)
-            arrays[f"{vehicle}/{preset}"] = np.array(of_seeds)
-            arrays[f"{vehicle}/{preset}/seconds"] = np.array(seconds)
+                print(vehicle, pilot, seed, seconds[-1], flush=True)
+            arrays[f"{vehicle}/{pilot}"] = np.array(of_seeds)
+            arrays[f"{vehicle}/{pilot}/seconds"] = np.array(seconds)
             np.savez_compressed(FLIGHTS, **arrays)
 
 
@@ -114,7 +129,7 @@ def sums() -> dict[str, Any]:
                 errors = arrays[f"{vehicle}/{pilot}"]
                 rows = {label: row_of(errors[:, place]) for place, label in enumerate(labels)}
                 result[vehicle][pilot] = {"cells": rows}
-                if pilot != "geometric":
+                if pilot not in OPTIONS:
                     seconds = arrays[f"{vehicle}/{pilot}/seconds"]
                     result[vehicle][pilot]["seconds"] = {
                         "median": float(np.median(seconds)), "most": float(seconds.max()),
@@ -171,7 +186,7 @@ def _shown(cell: dict[str, Any] | None) -> str:
 def main() -> None:
     vehicles = ["crazyflie2", "hummingbird", "paper"]
     args = options(__doc__, vehicles=vehicles, seeds=5, first_seed=700, flights=1000,
-                   only_sums=False).parse_args()  # fmt: skip
+                   pilots=list(PILOTS), only_sums=False).parse_args()  # fmt: skip
     if not args.only_sums:
         measure(args)
     result = sums()

@@ -7,11 +7,14 @@ one. Every number is float32. What a policy remembers of an episode goes in and 
 
 import json
 from collections.abc import Iterable
+from dataclasses import replace
 from importlib import import_module
 
 import numpy as np
 
 from ...envs.config import EnvConfig
+from ...envs.registry import env_spec
+from ...models import Vehicle
 from ...models.errors import InputError, require
 from ...models.library import is_pool
 from ..checkpoints import Checkpoint
@@ -39,6 +42,19 @@ def export(checkpoint: Checkpoint, target: str) -> bytes:
         require("onnx", "export", "--to onnx")
     module = import_module(f"{__name__}.{target}")
     return bytes(module.write(finite_policy(checkpoint), metadata(checkpoint)))
+
+
+def on_vehicle(checkpoint: Checkpoint, vehicle: str) -> Checkpoint:
+    """The policy on another craft, whose rotors lag if its file says how much. Raises `InputError`
+    where they do not fit.
+    """
+    if checkpoint.env is None:
+        raise InputError("vehicle: expected a policy that knows its env, got one without")
+    lags = Vehicle.load(vehicle).coefficients["rotors.time_constant"]
+    env = checkpoint.env.changed(vehicle=vehicle, effects={"motor_lag": bool(lags)}).resolve()
+    spec = env_spec(env)
+    checkpoint.policy(spec)
+    return replace(checkpoint, env=env, spec=spec)
 
 
 def write_layers(writer: object, layers: Iterable[Layer]) -> None:

@@ -13,6 +13,8 @@ from ...envs.config import EnvConfig
 from ...envs.spec import EnvSpec, component_names
 from ...models.errors import InputError, shortened
 from ...models.files import read_own_toml
+from ...models.library import is_pool
+from ...sim import Wrench, make_controller
 from ..checkpoints import Checkpoint
 from . import c, finite_policy, metadata
 
@@ -33,23 +35,25 @@ def app(checkpoint: Checkpoint) -> dict[str, bytes]:
     Raises `InputError`, which names what the firmware cannot know or do.
     """
     env = checkpoint.env
-    if env is None or len(env.vehicle) > 1:
+    if env is None or len(env.vehicle) > 1 or is_pool(env.vehicle[0]):
         raise InputError(
-            "export: expected a policy that was trained on one vehicle of this machine"
+            "export: expected a policy of one vehicle of this machine, which --vehicle may name"
         )
     _check_env(env)
     policy = finite_policy(checkpoint)
     facts = metadata(checkpoint)
     files = {name: (_FOLDER / name).read_bytes() for name in _FILES}
     files["rotorgram_policy.h"] = c.write(policy, facts)
-    lines = _firmware_macros(policy.spec, json.loads(facts["rotors"]))
+    lines = _firmware_macros(env, policy.spec, json.loads(facts["rotors"]))
     files["rotorgram_crazyflie.h"] = ("\n".join(lines) + "\n").encode()
     return files
 
 
 def _check_env(env: EnvConfig) -> None:
-    if env.action != "rotors":
-        raise InputError(f"action: expected rotors for the firmware's motors, got {env.action}")
+    if env.action not in ("rotors", "wrench"):
+        raise InputError(
+            f"action: expected rotors or wrench for the firmware's motors, got {env.action}"
+        )
     refused = [name for name in _REFUSED if getattr(env.effects, name)]
     if refused:
         raise InputError(
@@ -58,13 +62,16 @@ def _check_env(env: EnvConfig) -> None:
         )
 
 
-def _firmware_macros(spec: EnvSpec, rotors: dict[str, list[float]]) -> Iterator[str]:
+def _firmware_macros(
+    env: EnvConfig, spec: EnvSpec, rotors: dict[str, list[float]]
+) -> Iterator[str]:
     """Lines of the header that the controller's C includes beside the policy's."""
-    calls = spec.control_period * _CALLS
-    if abs(calls - round(calls)) > 1e-6:
-        raise InputError(
-            f"control_period: expected a whole number of milliseconds, got {spec.control_period} s"
-        )
+    calls = _calls("control_period", spec.control_period)
+    vehicle = env.load_vehicle()
+    controller = make_controller(str(env.action), vehicle, vehicle.timestep, env.effects)
+    driven = spec.control_period  # between two commands, s
+    if isinstance(controller, Wrench):
+        driven = vehicle.timestep
     frames = _NAMES["frames"]
     frame = spec.observation[0].frame
     if frame not in frames:
@@ -74,15 +81,45 @@ def _firmware_macros(spec: EnvSpec, rotors: dict[str, list[float]]) -> Iterator[
     bounds = [array.bounds() for array in spec.observation]
     lowest, highest = (np.concatenate(ends, axis=None) for ends in zip(*bounds, strict=True))
     lags = np.array(rotors["lags"])
-    lacking = np.exp(-spec.control_period / np.where(lags > 0.0, lags, 1e-9))
+    lacking = np.exp(-driven / np.where(lags > 0.0, lags, 1e-9))
     yield "/* SPDX-License-Identifier: MIT */"
-    yield f"#define ROTORGRAM_CALLS {round(calls)} /* of the controller, between two actions */"
+    yield f"#define ROTORGRAM_CALLS {calls} /* of the controller, between two actions */"
+    driven_calls = _calls("timestep", driven)
+    yield f"#define ROTORGRAM_DRIVEN {driven_calls} /* of it, between two commands of the rotors */"
     yield f"#define ROTORGRAM_BODY {frames[frame]} /* whether vectors are in the body frame */"
     yield c.macro("motors", _rotor_of_motors(rotors), "rotor of M1 to M4")
-    yield c.macro("lacking", lacking, "of a change of speed after a period, rising and falling")
+    yield c.macro("lacking", lacking, "of a change of speed between these, rising and falling")
     yield c.macro("lowest", lowest, "of the observation")
     yield c.macro("highest", highest, "of the observation")
     yield "#define ROTORGRAM_SOURCES {" + ", ".join(_sources(spec)) + "}"
+    if isinstance(controller, Wrench):
+        yield from _mixing_macros(controller, vehicle.gravity)
+
+
+def _calls(name: str, seconds: float) -> int:
+    """So many calls of the controller take this long."""
+    calls = seconds * _CALLS
+    if abs(calls - round(calls)) > 1e-6:
+        raise InputError(f"{name}: expected a whole number of milliseconds, got {seconds:g} s")
+    return round(calls)
+
+
+def _mixing_macros(wrench: Wrench, gravity: float) -> Iterator[str]:
+    """Lines about the craft, for the level `wrench`."""
+    plant = wrench.plant
+    count = len(plant.share)
+    rows = np.eye(count + 1, count, k=-1).tolist()
+    nothing, *each = (np.array(wrench.told(plant, row)) for row in rows)
+    lift, *turns = wrench.sizes(wrench.gains)
+    yield "#define ROTORGRAM_WRENCH"
+    yield c.macro("told", nothing, "of the observation, without thrust")
+    yield c.macro("told_more", np.subtract(each, nothing), "by a newton of each rotor")
+    yield c.macro("lift", (plant.mass * gravity, plant.mass * lift), "N: of actions of 0; of 1")
+    yield c.macro("torque", np.array(plant.inertia) * turns, "N m, of actions of 1")
+    yield c.macro("mix", plant.mix, "of rotors, N of collective thrust per N m")
+    yield c.macro("share", plant.share, "of rotors, of the collective thrust")
+    yield c.macro("collective", (plant.lowest, plant.highest), "N")
+    yield c.macro("lead", [plant.lead], "change of a command per wanted change of thrust")
 
 
 def _sources(spec: EnvSpec) -> Iterator[str]:

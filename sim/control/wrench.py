@@ -4,6 +4,7 @@ What a policy says is then no share of what one craft can do: the vehicle's file
 thrusts. Array code with any leading axes.
 """
 
+from collections.abc import Sequence
 from functools import reduce
 from typing import Any, NamedTuple
 
@@ -13,7 +14,7 @@ from ... import models
 from ...models.drawn import columns
 from ...models.matrices import inverse, times
 from ..effects import EffectOptions
-from ..state import Array, WorldState, clip, parts_of, total
+from ..state import Array, WorldState, clip, parts_of
 from .cascade import Mixing, Numbers, mixed
 from .gains import Gains, lead_of
 
@@ -60,7 +61,7 @@ class Wrench(Mixing):
 
     def __init__(self, vehicle: "models.Vehicle", gains: Gains, effects: EffectOptions) -> None:
         super().__init__(vehicle, gains, effects)
-        self._plant = Plant(
+        self.plant = Plant(
             mass=vehicle.mass,
             inertia=vehicle.inertia.tolist(),
             turn=inverse(vehicle.inertia).tolist(),
@@ -89,11 +90,13 @@ class Wrench(Mixing):
 
     def seen(self, state: WorldState) -> list[Array]:
         """What `SEEN` names, each (W, A)."""
-        plant = self._plant_of(state)
-        thrusts = parts_of(state.thrust)
+        return self.told(self._plant_of(state), parts_of(state.thrust))
+
+    def told(self, plant: Plant, thrusts: Sequence[Array]) -> list[Array]:
+        """What `SEEN` names, of a craft whose rotors give so many newtons each."""
         torque = [sum(a * b for a, b in zip(row, thrusts, strict=True)) for row in plant.torques]
         hover = plant.mass * self._gravity
-        lift = (total(state.thrust) - hover) / plant.mass
+        lift = (sum(thrusts) - hover) / plant.mass
         room = np.minimum(plant.highest - hover, hover - plant.lowest)
         most = [(plant.highest - hover) / plant.mass]
         for axis in range(3):
@@ -109,7 +112,7 @@ class Wrench(Mixing):
         ]
 
     def _plant_of(self, state: WorldState) -> Plant:
-        return self._plant if state.craft is None else _drawn_plant(state.craft, self._period)
+        return self.plant if state.craft is None else _drawn_plant(state.craft, self._period)
 
 
 def _drawn_plant(craft: Array, period: float) -> Plant:

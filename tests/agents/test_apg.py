@@ -182,6 +182,27 @@ def test_what_one_drone_counts_has_a_bound() -> None:
     sizes = np.linalg.norm(free, axis=(0, 2))
     assert sizes[1] > 4 * sizes[0]
     assert bounded[:, 1] == pytest.approx(free[:, 1] * (2 * sizes[0] / sizes[1]), rel=1e-4)
+    assert agent.terms["bounded"] == pytest.approx(1 / 3)
+
+
+def test_a_drone_whose_derivatives_are_no_numbers_counts_nothing(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    agent, rollout = climbing(2)
+    free = agent.slopes(rollout)
+    agent.config = replace(agent.config, most_of_one=2.0)
+    back = agent._derivative.back
+
+    def broken(*args: Any) -> np.ndarray:
+        slope = back(*args)
+        slope[1] = np.nan
+        return slope
+
+    monkeypatch.setattr(agent._derivative, "back", broken)
+    slopes = agent.slopes(rollout)
+    assert not slopes[:, 1].any()
+    assert slopes[:, [0, 2]].tolist() == free[:, [0, 2]].tolist()
+    assert agent.terms["bounded"] == pytest.approx(1 / 3)
 
 
 def valued(steps: int, **options: Any) -> tuple[SHAC, Rollout]:

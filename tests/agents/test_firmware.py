@@ -13,8 +13,10 @@ import pytest
 from nets import random_policy
 from rotorgram.agents import Checkpoint, load, preset, store
 from rotorgram.agents.episodes import Position
+from rotorgram.agents.export import on_vehicle
 from rotorgram.agents.export.crazyflie import app
 from rotorgram.cli import main
+from rotorgram.cli._env import UNIVERSAL
 from rotorgram.envs import LocalVectorEnv
 from rotorgram.envs.config import EnvConfig
 from rotorgram.envs.registry import env_spec
@@ -34,13 +36,13 @@ LAG = {"motor_lag": True}
 
 
 def checkpoint_of(
-    env_id: str = "rotorgram/Hover-v0", memory: int = 0, **keywords: Any
+    env_id: str = "rotorgram/Hover-v0", memory: int = 0, scale: float = 0.1, **keywords: Any
 ) -> Checkpoint:
     """A policy of random weights, of a Crazyflie on `rigid`."""
     given = {"vehicle": "crazyflie2", "backend": "rigid", "effects": LAG, **keywords}
     config = EnvConfig.from_keywords(env_id, **given)
     spec = env_spec(config)
-    policy = random_policy(spec, (16,), "tanh", 0.1, memory=memory)
+    policy = random_policy(spec, (16,), "tanh", scale, memory=memory)
     chosen = preset("ppo", "tuned", hidden=(16,), activation="tanh", memory=memory)
     return Checkpoint(
         algorithm="ppo",
@@ -106,14 +108,17 @@ def record(
     return np.array([*order, *state, calls])
 
 
-def flown(checkpoint: Checkpoint, goal: tuple[float, ...]) -> tuple[np.ndarray, np.ndarray]:
-    """What the firmware would see in three episodes of the env, with motors off in between, and
-    the actions: the policy's, and -1, no thrust, where they are off.
+def flown(
+    checkpoint: Checkpoint, goal: tuple[float, ...]
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """What the firmware would see in three episodes of the env, with motors off in between; the
+    actions: the policy's, and -1, no thrust, where they are off; and the commands after each, N.
     """
     assert checkpoint.env is not None
-    env = LocalVectorEnv(checkpoint.env, 1, autoreset_mode="Disabled")
+    plain = checkpoint.env.changed(backend={"name": "rigid", "compiled": False})
+    env = LocalVectorEnv(plain, 1, autoreset_mode="Disabled")
     policy = checkpoint.policy()
-    records, actions = [], []
+    records, actions, commands = [], [], []
     for seed in range(3):
         policy.reset()
         seen, _ = env.reset(seed=seed)
@@ -124,13 +129,15 @@ def flown(checkpoint: Checkpoint, goal: tuple[float, ...]) -> tuple[np.ndarray, 
             records.append(record(goal, *words))
             actions.append(np.array(policy.act(seen[0]), float))
             seen, _, terminated, truncated, _ = env.step(actions[-1][None])
+            commands.append(env.loop.world.state.command[0, 0].copy())
             done = bool(terminated[0] or truncated[0])
         records.append(record(None))
         actions.append(np.full(4, -1.0))
+        commands.append(np.zeros(4))
     env.close()
     assert len(actions) > 30
-    assert np.ptp(actions, axis=0).min() > 0.5
-    return np.array(records), np.array(actions)
+    assert np.ptp(actions, axis=0).min() > 0.1
+    return np.array(records), np.array(actions), np.array(commands)
 
 
 def asked(thrusts: np.ndarray) -> np.ndarray:
@@ -154,9 +161,35 @@ def test_it_asks_for_the_thrusts_of_the_policy(
 ) -> None:
     keywords, goal = CASES[case]
     checkpoint = checkpoint_of(flight_band=20.0, **keywords)
-    records, actions = flown(checkpoint, goal)
+    records, actions, _ = flown(checkpoint, goal)
     found = asked(forces(built(checkpoint), records))
     np.testing.assert_allclose(found, actions, rtol=0, atol=1e-5)
+
+
+@pytest.mark.parametrize("effects", [{}, LAG], ids=["ideal", "lag"])
+@pytest.mark.parametrize("env_id", ["rotorgram/Hover-v0", "rotorgram/Recovery-v0"])
+def test_it_mixes_and_drives_what_accelerations_ask_for(
+    env_id: str, effects: dict[str, bool], built: Callable[[Checkpoint], Path]
+) -> None:
+    """Beyond what the rotors can give, too."""
+    options = {"action": "wrench", "frame": "body", "heading": 40.0, "flight_band": 20.0}
+    checkpoint = checkpoint_of(
+        env_id, scale=0.4, goal=(2.0, -1.0, 15.0), effects=effects, **options
+    )
+    records, _, commands = flown(checkpoint, (2.0, -1.0, 15.0, 40.0))
+    assert (commands < 1e-9).any()
+    assert (commands > LARGEST - 1e-7).any()
+    np.testing.assert_allclose(forces(built(checkpoint), records), commands, rtol=0, atol=2e-5)
+
+
+def test_the_policy_for_every_craft_flies_the_crazyflie(
+    built: Callable[[Checkpoint], Path],
+) -> None:
+    checkpoint = on_vehicle(load(UNIVERSAL), "crazyflie2")
+    assert checkpoint.env
+    assert checkpoint.env.effects.motor_lag
+    records, _, commands = flown(checkpoint, (0.0, 0.0, 5.0, 0.0))
+    np.testing.assert_allclose(forces(built(checkpoint), records), commands, rtol=0, atol=2e-5)
 
 
 def test_rotors_of_another_order_that_fall_more_slowly(
@@ -171,7 +204,7 @@ def test_rotors_of_another_order_that_fall_more_slowly(
     vehicle = tmp_path / "turned.toml"
     vehicle.write_text(f"{head}{turned}[rotors]\n{rest}", encoding="utf-8")
     checkpoint = checkpoint_of(flight_band=20.0, vehicle=str(vehicle))
-    records, actions = flown(checkpoint, (0.0, 0.0, 5.0, 0.0))
+    records, actions, _ = flown(checkpoint, (0.0, 0.0, 5.0, 0.0))
     found = asked(forces(built(checkpoint), records))
     m1_last = np.roll(actions, 1, axis=1)  # the file now has M2, M3, M4, M1
     np.testing.assert_allclose(found, m1_last, rtol=0, atol=1e-5)
@@ -216,7 +249,10 @@ def test_an_axis_without_a_wanted_position_keeps_the_last(
 
 
 REFUSED: dict[str, tuple[dict[str, Any], str]] = {
-    "level": ({"action": "rates"}, "action: expected rotors for the firmware's motors, got rates"),
+    "level": (
+        {"action": "rates"},
+        "expected rotors or wrench for the firmware's motors, got rates",
+    ),
     "number": (
         {"env_id": "rotorgram/Waypoints-v0"},
         "observation: expected numbers that the Crazyflie's firmware knows, "
@@ -262,6 +298,12 @@ def test_the_command_writes_a_new_folder(
     assert b"SPDX-License-Identifier: MIT" in files["Makefile"] + files["rotorgram_controller.c"]
     assert main(words) == 1
     assert "out: expected a new folder" in capsys.readouterr().err
+    words = ["export", "universal", "--to", "crazyflie", "-o", str(tmp_path / "any")]
+    assert main(words) == 1
+    assert "one vehicle of this machine, which --vehicle may name" in capsys.readouterr().err
+    assert main([*words, "--vehicle", "hummingbird"]) == 0
+    assert not main([*words[:3], "c", "-o", str(tmp_path / "any.h"), "--vehicle", "heavy_hexa"])
+    assert b"rotorgram" in (tmp_path / "any.h").read_bytes()
 
 
 def test_the_header_has_the_numbers_of_the_rotors() -> None:

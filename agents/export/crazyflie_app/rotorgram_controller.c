@@ -29,7 +29,22 @@ static const float largest[] = ROTORGRAM_LARGEST;
 static const float lowest[] = ROTORGRAM_LOWEST;
 static const float highest[] = ROTORGRAM_HIGHEST;
 
-/* What a rotor's speed still lacks of its command after a period, as a share: rising and falling. */
+#ifdef ROTORGRAM_WRENCH
+#define TOLD 9
+/* What is told of the craft: without thrust, and more by a newton of each rotor. */
+static const float told[TOLD] = ROTORGRAM_TOLD;
+static const float told_more[ROTORGRAM_ROTORS * TOLD] = ROTORGRAM_TOLD_MORE;
+
+static const float lift[] = ROTORGRAM_LIFT;             /* of actions of 0, and 1 more, N */
+static const float torque_of[] = ROTORGRAM_TORQUE;      /* of actions of 1, N m, rows of 3 */
+static const float mix[] = ROTORGRAM_MIX;               /* N by N m, a row of 3 for each rotor */
+static const float share[] = ROTORGRAM_SHARE;           /* of the collective thrust */
+static const float collective[] = ROTORGRAM_COLLECTIVE; /* its ends, N */
+static const float lead[] = ROTORGRAM_LEAD;
+static float wanted[ROTORGRAM_ROTORS]; /* thrusts, N */
+#endif
+
+/* What a rotor's speed still lacks of its command after a step, as a share: rising and falling. */
 static const float lacking[] = ROTORGRAM_LACKING;
 static const int rotor_of_motor[] = ROTORGRAM_MOTORS;
 
@@ -47,10 +62,13 @@ static rotorgram_policy_state memory;
 struct seen {
     float way[3];      /* to the goal, m */
     float velocity[3]; /* m/s */
-    float nose[3], thrust_axis[3], up[3];
+    float nose[3], thrust_axis[3], up[3], wanted_nose[3];
     float rates[3];  /* body, rad/s */
     float force[3];  /* specific, body, m/s^2 */
     float over[ROTORGRAM_ROTORS]; /* thrust over that of a hover, minus 1 */
+#ifdef ROTORGRAM_WRENCH
+    float told[TOLD]; /* accelerations now, the largest ones and the lag, over their units */
+#endif
 };
 
 static float within(float value, float low, float high)
@@ -127,8 +145,10 @@ static struct seen look(const sensorData_t *sensors, const state_t *state)
     into_frame(axes, velocity, seen.velocity);
     into_frame(axes, axes[0], seen.nose);
     into_frame(axes, axes[2], seen.thrust_axis);
-    for (int i = 0; i < 3; i++)
+    for (int i = 0; i < 3; i++) {
         seen.up[i] = axes[i][2];
+        seen.wanted_nose[i] = cosf(heading) * axes[i][0] + sinf(heading) * axes[i][1];
+    }
     seen.rates[0] = sensors->gyro.x * RADIANS;
     seen.rates[1] = sensors->gyro.y * RADIANS;
     seen.rates[2] = sensors->gyro.z * RADIANS;
@@ -137,8 +157,44 @@ static struct seen look(const sensorData_t *sensors, const state_t *state)
     seen.force[2] = sensors->acc.z * GRAVITY;
     for (int i = 0; i < ROTORGRAM_ROTORS; i++)
         seen.over[i] = thrust[i] / hover[i] - 1.0f;
+#ifdef ROTORGRAM_WRENCH
+    for (int i = 0; i < TOLD; i++) {
+        seen.told[i] = told[i];
+        for (int rotor = 0; rotor < ROTORGRAM_ROTORS; rotor++)
+            seen.told[i] += told_more[rotor * TOLD + i] * thrust[rotor];
+    }
+#endif
     return seen;
 }
+
+#ifdef ROTORGRAM_WRENCH
+/* Thrusts of a collective thrust and a torque. Roll and pitch come first, scaled down alike where they span more than the rotors'
+ * range; the collective thrust moves as little as makes room for them; yaw gets the room that is left. */
+static void mixed(float thrust_sum, const float torque[3])
+{
+    const float low = collective[0], high = collective[1];
+    float part[ROTORGRAM_ROTORS], lower = 0.0f, upper = 0.0f, yaw = torque[2];
+    for (int i = 0; i < ROTORGRAM_ROTORS; i++) {
+        part[i] = mix[3 * i] * torque[0] + mix[3 * i + 1] * torque[1];
+        lower = i == 0 ? part[i] : fminf(lower, part[i]);
+        upper = i == 0 ? part[i] : fmaxf(upper, part[i]);
+    }
+    const float scale = fminf((high - low) / fmaxf(upper - lower, 1e-9f * high), 1.0f);
+    const float middle = fminf(fmaxf(thrust_sum, low - scale * lower), high - scale * upper);
+    float least = -INFINITY, most = INFINITY; /* of yaw */
+    for (int i = 0; i < ROTORGRAM_ROTORS; i++) {
+        const float by = mix[3 * i + 2];
+        part[i] = middle + scale * part[i];
+        if (by != 0.0f) {
+            least = fmaxf(least, fminf((low - part[i]) / by, (high - part[i]) / by));
+            most = fminf(most, fmaxf((low - part[i]) / by, (high - part[i]) / by));
+        }
+    }
+    yaw = fminf(fmaxf(yaw, least), most); /* where there is no room, the upper end holds */
+    for (int i = 0; i < ROTORGRAM_ROTORS; i++)
+        wanted[i] = share[i] * (part[i] + mix[3 * i + 2] * yaw);
+}
+#endif
 
 static void act(const sensorData_t *sensors, const state_t *state)
 {
@@ -152,16 +208,33 @@ static void act(const sensorData_t *sensors, const state_t *state)
 #else
     rotorgram_policy(observation, action);
 #endif
+#ifdef ROTORGRAM_WRENCH
+    float torque[3];
+    for (int i = 0; i < 3; i++)
+        torque[i] = torque_of[3 * i] * action[1] + torque_of[3 * i + 1] * action[2] + torque_of[3 * i + 2] * action[3];
+    mixed(lift[0] + lift[1] * action[0], torque);
+#else
     for (int i = 0; i < ROTORGRAM_ROTORS; i++) {
         const float room = action[i] > 0.0f ? largest[i] - hover[i] : hover[i] - least[i];
         command[i] = hover[i] + room * action[i];
+    }
+#endif
+}
+
+/* Before each step of the rotors. */
+static void drive(void)
+{
+    for (int i = 0; i < ROTORGRAM_ROTORS; i++) {
+#ifdef ROTORGRAM_WRENCH
+        command[i] = within(thrust[i] + lead[0] * (wanted[i] - thrust[i]), least[i], largest[i]);
+#endif
 #ifdef THRUST_MAX /* what the battery compensation can hold */
         command[i] = within(command[i], least[i], THRUST_MAX);
 #endif
     }
 }
 
-/* The speeds of the rotors, as roots of their thrusts, follow the commands for one period. */
+/* The speeds of the rotors, as roots of their thrusts, follow the commands for one step. */
 static void turn_rotors(void)
 {
     for (int i = 0; i < ROTORGRAM_ROTORS; i++) {
@@ -205,13 +278,15 @@ void controllerOutOfTree(control_t *control, const setpoint_t *setpoint, const s
     } else {
         if (!flying)
             begin(state);
-        else if (wait == 0)
+        else if (wait % ROTORGRAM_DRIVEN == 0)
             turn_rotors();
         aim(setpoint);
         if (wait == 0) {
             act(sensors, state);
             wait = ROTORGRAM_CALLS;
         }
+        if (wait % ROTORGRAM_DRIVEN == 0)
+            drive();
         wait--;
     }
     push(control);
