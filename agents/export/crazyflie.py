@@ -6,15 +6,16 @@ The folder `crazyflie_app` has the files that are the same for every policy.
 import json
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from ...envs.config import EnvConfig
 from ...envs.spec import EnvSpec, component_names
+from ...envs.specification import make_task
 from ...models.errors import InputError, shortened
 from ...models.files import read_own_toml
 from ...models.library import is_pool
-from ...sim import Wrench, make_controller
 from ..checkpoints import Checkpoint
 from . import c, finite_policy, metadata
 
@@ -68,10 +69,8 @@ def _firmware_macros(
     """Lines of the header that the controller's C includes beside the policy's."""
     calls = _calls("control_period", spec.control_period)
     vehicle = env.load_vehicle()
-    controller = make_controller(str(env.action), vehicle, vehicle.timestep, env.effects)
-    driven = spec.control_period  # between two commands, s
-    if isinstance(controller, Wrench):
-        driven = vehicle.timestep
+    mixes = env.action == "wrench"
+    driven = vehicle.timestep if mixes else spec.control_period  # between two commands, s
     frames = _NAMES["frames"]
     frame = spec.observation[0].frame
     if frame not in frames:
@@ -92,8 +91,8 @@ def _firmware_macros(
     yield c.macro("lowest", lowest, "of the observation")
     yield c.macro("highest", highest, "of the observation")
     yield "#define ROTORGRAM_SOURCES {" + ", ".join(_sources(spec)) + "}"
-    if isinstance(controller, Wrench):
-        yield from _mixing_macros(controller, vehicle.gravity)
+    if mixes:
+        yield from _mixing_macros(make_task(env.resolve(), (1, 1)).controller, vehicle.gravity)
 
 
 def _calls(name: str, seconds: float) -> int:
@@ -104,8 +103,8 @@ def _calls(name: str, seconds: float) -> int:
     return round(calls)
 
 
-def _mixing_macros(wrench: Wrench, gravity: float) -> Iterator[str]:
-    """Lines about the craft, for the level `wrench`."""
+def _mixing_macros(wrench: Any, gravity: float) -> Iterator[str]:
+    """Lines about the craft, for the level `wrench`: of its controller."""
     plant = wrench.plant
     count = len(plant.share)
     rows = np.eye(count + 1, count, k=-1).tolist()
