@@ -28,12 +28,17 @@ class APGConfig(Config):
     max_grad_norm: Positive = 1.0
     """The gradient, as one vector, is scaled down to this length."""
     most_of_one: Positive | None = None
-    """The derivatives by the actions of one drone are scaled down to this many times the median of
-    all drones, for those of a craft that is hard to hold grow with every step; what is no number
-    counts as 0. Null: neither.
+    """Bound of one drone's derivatives by its actions: their norm is at most this many times the
+    median of all drones, because those of a craft that is hard to hold grow with every step. A
+    drone with one that is not finite counts as 0. Null: no bound.
     """
 
     remembers = False
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.anneal_clip:
+            raise InputError("anneal_clip: expected false where rewards are derived, got true")
 
 
 class APG(Learner):
@@ -107,10 +112,13 @@ class APG(Learner):
                 by_observations[step - 1] += goes_on * network.back(slope.T).T
         if config.most_of_one:
             sizes = np.sqrt(np.square(slopes).sum(axis=(0, 2)))
-            most = config.most_of_one * np.nanmedian(sizes)
-            slopes *= (most / np.maximum(sizes, most))[:, np.newaxis]
-            slopes[:, ~np.isfinite(sizes)] = 0.0
-            self.terms["bounded"] = np.mean(~(sizes <= most))
+            fine = np.isfinite(sizes)
+            if fine.any():  # else training diverged
+                most = config.most_of_one * np.median(sizes[fine])
+                large = fine & (sizes > most)
+                slopes[:, large] *= (most / sizes[large])[:, np.newaxis]
+                slopes[:, ~fine] = 0.0
+                self.terms["bounded"] = np.mean(large | ~fine)
         return slopes
 
     def beyond(self, rollout: Rollout) -> Floats:
@@ -141,15 +149,15 @@ class SHAC(APG):
     """Short-horizon actor-critic: a flight that goes on counts with its value, Equation 5.
 
     The critic descends the squared error to TD(λ), Equation 7, after the actor's step. Not as in
-    the paper: it has no target network, Adam has its usual constants, and an episode may end at any
-    step of a rollout.
+    the paper: it has no target network, Adam has its usual constants, the noise stays as large, and
+    an episode may end at any step of a rollout, where powers of gamma run on.
     """
 
     config: SHACConfig
 
     def __init__(self, log: EpisodeRecorder, config: SHACConfig, seed: int) -> None:
         super().__init__(log, config, seed)
-        self._critic = make_network(self.spec.observation, 1, config)
+        self._critic = make_network(self._actor.spec.observation, 1, config)
         self._judge = Weights.zeros(self._critic.shapes)
         self._critic.bind(self._judge)
         self._critic.initialise(self._rng, 1.0)
@@ -188,16 +196,16 @@ class SHAC(APG):
     def beyond(self, rollout: Rollout) -> Floats:
         """Of the value where a flight goes on, after the last step and after a truncation."""
         config = self.config
-        after = rollout.next_observations
-        self._values(after)
+        self._values(rollout.next_observations)
         steps, drones = rollout.kept.shape
         slopes = self._critic.back(np.ones((1, steps * drones), np.float32)).T
+        slopes = slopes.reshape(steps, drones, -1)
         goes_on = rollout.truncated.copy()
         goes_on[-1] = True
         goes_on &= rollout.kept & ~rollout.terminated
         weights = config.gamma ** np.arange(1, steps + 1) * (-1 / len(rollout))
-        by_after = slopes.reshape(after.shape) * (weights[:, np.newaxis] * goes_on)[..., np.newaxis]
-        return by_after[..., : self._actor.network.inputs].astype(np.float32)
+        by_after = slopes * (weights[:, np.newaxis] * goes_on)[..., np.newaxis]
+        return by_after.astype(np.float32)
 
     def _values(self, observations: Floats) -> Numbers:
         """V of observations (T, N, n), (T, N)."""

@@ -13,11 +13,11 @@ class Export(ModuleFlag):
     """Write a trained policy as a file, or an app of a firmware, that flies without rotorgram."""
 
     policy: Positional[Annotated[str, arg(metavar="CHECKPOINT")]]
-    """Checkpoint, or folder of a training."""
+    """Checkpoint, folder of a training, or `universal`."""
     to: Literal["onnx", "c", "crazyflie"]
     """Kind of file; or a folder that builds to the Crazyflie's firmware with the policy in it."""
     vehicle: str | None = None
-    """Craft that flies it, of a policy for every craft: a name or a file. Default: that of its
+    """Craft that a policy of the level wrench flies: a name or a file. Default: that of its
     training."""
     out: Annotated[Path | None, arg(aliases=["-o"])] = None
     """File or folder to write, a new one. Default: policy.onnx, rotorgram_policy.h or
@@ -28,10 +28,10 @@ class Export(ModuleFlag):
         from ..agents.export import TARGETS, export, on_vehicle
         from ..agents.export.crazyflie import app
         from ..flights.folders import new_folder
-        from ._env import trained
+        from ._env import UNIVERSAL, trained
 
-        checkpoint = trained(self.policy)
-        if self.vehicle:
+        checkpoint = trained(self.policy, UNIVERSAL.stem)
+        if self.vehicle is not None:
             checkpoint = on_vehicle(checkpoint, self.vehicle)
         if self.to == "crazyflie":
             files = app(checkpoint)

@@ -7,10 +7,10 @@
 For each vehicle and seed `rotorgram train ppo --env rotorgram/Hover-v0` trains with the presets
 robust and tuned; the clock runs from before the process starts to after it has ended. Both then fly
 the perturbations for which the first was trained, alone and all together, and so do `geometric` and
-the policy `universal`, from starts that no training has seen. Flights of pilots that are not named
-stay. `docs/results/robust_flights.npz` gets the steady error of
-every flight in millimetres, 65535 of one that crashed, from which `--only-sums` computes
-`docs/results/robust.json` again.
+the policy `universal`, from starts that no training has seen.
+`docs/results/robust_flights.npz` gets the steady error of every flight in millimetres, 65535 of one
+that crashed, from which `--only-sums` computes `docs/results/robust.json` again. Flights of pilots
+that are not named stay in it.
 
 It takes some ten minutes on two cores.
 """
@@ -96,7 +96,9 @@ def measure(args: Any) -> None:
     for vehicle in args.vehicles:
         cells = cells_of(vehicle)
         labels = ["all together" if cell.row == TOGETHER else cell.label for cell in cells]
-        arrays[f"{vehicle}/cells"] = np.array(labels)
+        kept_labels = arrays.setdefault(f"{vehicle}/cells", np.array(labels)).tolist()
+        if kept_labels != labels:
+            raise InputError(f"robust: expected the cells of {FLIGHTS}, got {labels}; remove it")
         for pilot in args.pilots:
             if pilot in OPTIONS:
                 errors = flown(pilot, cells, args.flights, **OPTIONS[pilot])
@@ -125,7 +127,7 @@ def sums() -> dict[str, Any]:
         for vehicle in vehicles:
             labels = arrays[f"{vehicle}/cells"].tolist()
             result[vehicle] = {}
-            for pilot in PILOTS:
+            for pilot in [one for one in PILOTS if f"{vehicle}/{one}" in arrays]:
                 errors = arrays[f"{vehicle}/{pilot}"]
                 rows = {label: row_of(errors[:, place]) for place, label in enumerate(labels)}
                 result[vehicle][pilot] = {"cells": rows}

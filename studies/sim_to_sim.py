@@ -1,16 +1,17 @@
 """Policies from one simulator in another: RAPTOR in ours, ours in rl-tools' simulator.
 
     pip install 'rotorgram[raptor]' l2f    # which needs a C++ compiler
-    python studies/sim_to_sim.py [--flights 200] [--vehicles crazyflie2 ...]
+    python studies/sim_to_sim.py [--flights 200] [--vehicles crazyflie2 ...] [--again universal]
 
 writes `docs/results/sim_to_sim.json` with three parts, and `sim_to_sim.csv.gz` with every flight.
-`--page` prints the tables of `docs/pilots.md` from that file.
+`--page` prints the tables of `docs/pilots.md` from that file; `--again` flies cells of one pilot
+alone, and keeps all else.
 
 **Agreement**: how far l2f and our backends are apart after the same motor commands, recorded from a
 flight of RAPTOR, all at steps of 1 ms. l2f, which has single precision, gets mass, inertia, rotors,
 thrust and lag from our vehicle; the square root of a thrust is its motors' speed, as in ours.
 
-**Cells**: every quadcopter of the library flown by `geometric`, by PPO and by RAPTOR, on the
+**Cells**: every quadcopter of the library flown by `geometric`, PPO, RAPTOR and `universal`, on the
 backends `rigid` and `mujoco` and in l2f, from the same starts of `Hover-v0`. l2f takes the place of
 the physics alone: task, observation and crashes are ours. PPO is trained on `rigid`, with the
 task's tuned preset, seed 0. Motor lag is on where the vehicle has a time constant.
@@ -35,7 +36,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import astuple
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Self
 from unittest import mock
 
 import l2f
@@ -45,6 +46,7 @@ from independent import Flight
 from measuring import RESULTS, options, table, write
 from rotorgram.agents import find_controller, load
 from rotorgram.agents.raptor import layout
+from rotorgram.cli._env import UNIVERSAL
 from rotorgram.envs import LocalVectorEnv
 from rotorgram.envs.config import EnvConfig
 from rotorgram.flights.trajectories import Trajectory, fly_episodes
@@ -59,7 +61,7 @@ from rotorgram.training.statistics import share_interval
 
 TASK = "rotorgram/Hover-v0"
 VEHICLES = ["crazyflie2", "crazyflie_brushless", "hummingbird", "skydio_x2", "paper"]
-AGENTS = ("geometric", "ppo", "raptor")
+AGENTS = ("geometric", "ppo", "raptor", "universal")
 SIMULATORS = ("rigid", "mujoco", "l2f")
 SECONDS = 5.0
 PERIOD = 0.01  # s, between RAPTOR's actions
@@ -329,11 +331,15 @@ def trained(vehicle: str, folder: Path) -> Any:
 
 def flights_of(vehicle: str, agent: str, where: str, ppo: Any, count: int) -> list[Trajectory]:
     """Evaluation episodes, the same starts for all."""
-    needed = {} if agent == "ppo" else find_controller(agent).options
+    if agent == "universal":
+        make, needed = load(UNIVERSAL).policy, {"action": "wrench", "frame": "body"}
+    elif agent == "ppo":
+        make, needed = ppo.policy, {}
+    else:
+        make, needed = find_controller(agent), find_controller(agent).options
     with simulator(where) as backend:
         config = config_of(vehicle, **needed, **backend)
         with closing(LocalVectorEnv(config, min(WORLDS, count), autoreset_mode="Disabled")) as env:
-            make = ppo.policy if agent == "ppo" else find_controller(agent)
             return fly_episodes(env, make(env.env_spec), count, "final")
 
 
@@ -490,6 +496,18 @@ class Result:
         self._told: dict[str, Any] = {"flights": count, "agreement": {}}
         self._flights: list[tuple[object, ...]] = []
 
+    @classmethod
+    def without(cls, out: Path, agent: str) -> Self:
+        """That of the files, without the cells of a pilot."""
+        told = json.loads(out.read_text(encoding="utf-8"))
+        self = cls(out, told["flights"])
+        told["cells"] = [row for row in told["cells"] if row["agent"] != agent]
+        self._told = told
+        text = gzip.decompress(out.with_suffix(".csv.gz").read_bytes()).decode()
+        rows = [tuple(row) for row in csv.reader(text.splitlines()[1:])]
+        self._flights = [row for row in rows if row[0] != "cells" or row[1].split()[1] != agent]
+        return self
+
     def agree(self, vehicle: str, row: Row) -> None:
         """Add how far the simulators are apart."""
         self._told["agreement"][vehicle] = row
@@ -549,12 +567,29 @@ def page(result: Mapping[str, Any]) -> str:
     return table(head, rows) + "\n\n" + table(alone_head, apart)
 
 
+def fly_cells(result: Result, vehicles: Sequence[str], agents: Sequence[str], count: int) -> None:
+    """Add the cells of some pilots."""
+    for name in vehicles:
+        with tempfile.TemporaryDirectory() as folder:
+            ppo = trained(name, Path(folder) / "ppo") if "ppo" in agents else None
+            for agent in agents:
+                for where in SIMULATORS:
+                    keys = {"vehicle": name, "agent": agent, "simulator": where}
+                    flights = flights_of(name, agent, where, ppo, count)
+                    result.add("cells", keys, [flown_of(flight) for flight in flights])
+
+
 def main() -> None:
     out = RESULTS / "sim_to_sim.json"
-    parser = options(__doc__, flights=200, vehicles=VEHICLES, out=out, page=False)
+    parser = options(__doc__, flights=200, vehicles=VEHICLES, out=out, page=False,
+                     again="")  # fmt: skip
     args = parser.parse_args()
     if args.page:
         print(page(json.loads(args.out.read_text(encoding="utf-8"))))
+        return
+    if args.again:
+        result = Result.without(args.out, args.again)
+        fly_cells(result, args.vehicles, [args.again], args.flights)
         return
     result = Result(args.out, args.flights)
     for name in args.vehicles:
@@ -583,14 +618,7 @@ def main() -> None:
                 }
                 if other.thrust_to_weight > 1.05:
                     result.add("varied", keys, alone(other, starts, turn))
-    for name in args.vehicles:
-        with tempfile.TemporaryDirectory() as folder:
-            ppo = trained(name, Path(folder) / "ppo")
-            for agent in AGENTS:
-                for where in SIMULATORS:
-                    keys = {"vehicle": name, "agent": agent, "simulator": where}
-                    flights = flights_of(name, agent, where, ppo, args.flights)
-                    result.add("cells", keys, [flown_of(flight) for flight in flights])
+    fly_cells(result, args.vehicles, AGENTS, args.flights)
     print(page(json.loads(args.out.read_text(encoding="utf-8"))))
 
 

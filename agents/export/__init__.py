@@ -45,13 +45,19 @@ def export(checkpoint: Checkpoint, target: str) -> bytes:
 
 
 def on_vehicle(checkpoint: Checkpoint, vehicle: str) -> Checkpoint:
-    """The policy on another craft, whose rotors lag if its file says how much. Raises `InputError`
-    where they do not fit.
+    """A policy of the level `wrench` on another craft, whose rotors lag if its file says how much.
+
+    Raises `InputError`.
     """
-    if checkpoint.env is None:
-        raise InputError("vehicle: expected a policy that knows its env, got one without")
+    env = checkpoint.env
+    if env is None or env.action != "wrench":
+        raise InputError(
+            "vehicle: expected none but for a policy of the level wrench, which means the same to "
+            f"every craft, got {vehicle}"
+        )
     lags = Vehicle.load(vehicle).coefficients["rotors.time_constant"]
-    env = checkpoint.env.changed(vehicle=vehicle, effects={"motor_lag": bool(lags)}).resolve()
+    effects = {**env.effects.to_options(), "motor_lag": bool(lags)}
+    env = env.changed(vehicle=vehicle, effects=effects, randomize={}, observe_drawn=False).resolve()
     spec = env_spec(env)
     checkpoint.policy(spec)
     return replace(checkpoint, env=env, spec=spec)

@@ -36,10 +36,12 @@ def app(checkpoint: Checkpoint) -> dict[str, bytes]:
     Raises `InputError`, which names what the firmware cannot know or do.
     """
     env = checkpoint.env
-    if env is None or len(env.vehicle) > 1 or is_pool(env.vehicle[0]):
+    if env is None or len(env.vehicle) > 1:
         raise InputError(
-            "export: expected a policy of one vehicle of this machine, which --vehicle may name"
+            "export: expected a policy that was trained on one vehicle of this machine"
         )
+    if is_pool(env.vehicle[0]):
+        raise InputError(f"vehicle: expected one craft (--vehicle), got {env.vehicle[0]}")
     _check_env(env)
     policy = finite_policy(checkpoint)
     facts = metadata(checkpoint)
@@ -70,7 +72,8 @@ def _firmware_macros(
     calls = _calls("control_period", spec.control_period)
     vehicle = env.load_vehicle()
     mixes = env.action == "wrench"
-    driven = vehicle.timestep if mixes else spec.control_period  # between two commands, s
+    often = mixes and not env.estimated
+    driven = vehicle.timestep if often else spec.control_period  # between two commands, s
     frames = _NAMES["frames"]
     frame = spec.observation[0].frame
     if frame not in frames:
@@ -99,12 +102,15 @@ def _calls(name: str, seconds: float) -> int:
     """So many calls of the controller take this long."""
     calls = seconds * _CALLS
     if abs(calls - round(calls)) > 1e-6:
-        raise InputError(f"{name}: expected a whole number of milliseconds, got {seconds:g} s")
+        raise InputError(
+            f"{name}: expected a whole number of milliseconds, as the firmware counts them, "
+            f"got {seconds:g} s"
+        )
     return round(calls)
 
 
 def _mixing_macros(wrench: Any, gravity: float) -> Iterator[str]:
-    """Lines about the craft, for the level `wrench`: of its controller."""
+    """Numbers of the controller of the level `wrench`."""
     plant = wrench.plant
     count = len(plant.share)
     rows = np.eye(count + 1, count, k=-1).tolist()
@@ -143,6 +149,6 @@ def _rotor_of_motors(rotors: dict[str, list[float]]) -> list[int]:
     if len(places) != 4 or turns != [1, -1, 1, -1] or min(rotors["least"]) < 0.0:
         raise InputError(
             "vehicle: expected four rotors that turn as the Crazyflie's do, the front right one "
-            f"anticlockwise, got {len(places)} of turns {rotors['turns']}"
+            f"anticlockwise, got {len(places)} of turns {turns}"
         )
     return found

@@ -9,7 +9,7 @@ import pytest
 from nets import arrays_of
 from rotorgram.agents import EpisodeRecorder, find_preset, load, make_agent, store
 from rotorgram.agents.apg import APG, SHAC, APGConfig, SHACConfig
-from rotorgram.agents.rollouts import Collector, Rollout
+from rotorgram.agents.rollouts import Collector, Diverged, Rollout
 from rotorgram.cli import main
 from rotorgram.envs import LocalVectorEnv, Outcome, register
 from rotorgram.envs.config import EnvConfig
@@ -200,9 +200,23 @@ def test_a_drone_whose_derivatives_are_no_numbers_counts_nothing(
 
     monkeypatch.setattr(agent._derivative, "back", broken)
     slopes = agent.slopes(rollout)
+    assert agent.terms["bounded"] == pytest.approx(1 / 3)
     assert not slopes[:, 1].any()
     assert slopes[:, [0, 2]].tolist() == free[:, [0, 2]].tolist()
-    assert agent.terms["bounded"] == pytest.approx(1 / 3)
+
+
+def test_if_no_derivative_is_a_number_training_has_diverged() -> None:
+    config = SHACConfig(horizon=4, most_of_one=3.0)
+    agent, log = agent_of(drones=4, config=config)
+    assert isinstance(agent, SHAC)
+    agent._judge.values[...] = np.nan
+    with pytest.raises(Diverged, match="weights are not finite after update 1"):
+        agent.train(log, 64, lambda: True)
+
+
+def test_a_bound_of_rewards_that_grows_is_refused() -> None:
+    with pytest.raises(InputError, match="anneal_clip: expected false where rewards are derived"):
+        APGConfig(reward_clip=8.0, anneal_clip=True)
 
 
 def valued(steps: int, **options: Any) -> tuple[SHAC, Rollout]:

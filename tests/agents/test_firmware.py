@@ -20,8 +20,12 @@ from rotorgram.cli._env import UNIVERSAL
 from rotorgram.envs import LocalVectorEnv
 from rotorgram.envs.config import EnvConfig
 from rotorgram.envs.registry import env_spec
+from rotorgram.models import Vehicle
 from rotorgram.models.errors import InputError
 from rotorgram.models.library import find_vehicle
+from rotorgram.sim.control.cascade import mixed
+from rotorgram.sim.control.gains import Gains
+from rotorgram.sim.control.wrench import SIZES
 from test_peers import ROOT, compiled, tool
 
 STUB = ROOT / "tests" / "data" / "crazyflie_stub"
@@ -58,15 +62,15 @@ def checkpoint_of(
 
 
 @pytest.fixture
-def built(tmp_path: Path) -> Callable[[Checkpoint], Path]:
-    def build(checkpoint: Checkpoint) -> Path:
+def built(tmp_path: Path) -> Callable[..., Path]:
+    def build(checkpoint: Checkpoint, *flags: str) -> Path:
         for name, content in app(checkpoint).items():
             (tmp_path / name).write_bytes(content)
         for file in STUB.iterdir():
             shutil.copy(file, tmp_path)
         sources = [tmp_path / "rotorgram_controller.c", tmp_path / "main.c"]
         program = tmp_path / "app"
-        compiled(tool("gcc"), *C_FLAGS, *CHECKED, "-o", program, *sources, "-lm")
+        compiled(tool("gcc"), *C_FLAGS, *CHECKED, *flags, "-o", program, *sources, "-lm")
         return program
 
     return build
@@ -182,6 +186,39 @@ def test_it_mixes_and_drives_what_accelerations_ask_for(
     np.testing.assert_allclose(forces(built(checkpoint), records), commands, rtol=0, atol=2e-5)
 
 
+def test_roll_and_pitch_come_first_below_what_the_battery_holds_too(
+    built: Callable[..., Path],
+) -> None:
+    """The firmware's largest thrust of a rotor is less than that of the vehicle's file."""
+    most = 0.12
+    options = {"action": "wrench", "frame": "body", "flight_band": 20.0, "effects": {}}
+    checkpoint = checkpoint_of(scale=0.4, **options)
+    first = checkpoint.actor["layers.0.weight"]
+    first[:, 16:20] = 0.0  # blind to what its rotors do: they are stronger in the env
+    records, actions, _ = flown(checkpoint, (0.0, 0.0, 5.0, 0.0))
+    vehicle = Vehicle.load("crazyflie2")
+    weaker = replace(Gains.of(vehicle, 0.005), highest=4 * most)
+    lift, *turns = (np.array(SIZES) * actions).T
+    thrusts = mixed(weaker, 0.027 * (9.81 + lift), list(vehicle.inertia @ turns))
+    off = records[:, 0] == 0
+    expected = np.where(off[:, None], 0.0, np.stack(thrusts, axis=-1))
+    assert (expected > most - 1e-7).any()
+    found = forces(built(checkpoint, f"-DTHRUST_MAX={most}f"), records)
+    np.testing.assert_allclose(found, expected, rtol=0, atol=2e-5)
+
+
+def test_an_estimate_drives_the_rotors_once_in_a_control_period() -> None:
+    options = {"action": "wrench", "frame": "body"}
+    mocap = {"noise": 0.001, "angle_noise": 0.002}
+    sensors = {"imu": True, "motion_capture": mocap, "estimate": True, "observe": "estimate"}
+    for checkpoint, calls in (
+        (checkpoint_of(**options), 5),
+        (checkpoint_of(**options, sensors=sensors), 20),
+    ):
+        header = app(checkpoint)["rotorgram_crazyflie.h"].decode()
+        assert f"#define ROTORGRAM_DRIVEN {calls} " in header
+
+
 def test_the_policy_for_every_craft_flies_the_crazyflie(
     built: Callable[[Checkpoint], Path],
 ) -> None:
@@ -275,7 +312,9 @@ def test_what_the_firmware_cannot_do_is_refused_by_name(case: str) -> None:
 def test_a_control_period_of_part_of_a_millisecond_is_refused() -> None:
     checkpoint = checkpoint_of()
     spec = replace(checkpoint.spec, control_period=0.0125)
-    with pytest.raises(InputError, match=r"a whole number of milliseconds, got 0.0125 s$"):
+    with pytest.raises(
+        InputError, match=r"milliseconds, as the firmware counts them, got 0.0125 s$"
+    ):
         app(replace(checkpoint, spec=spec))
 
 
@@ -300,10 +339,13 @@ def test_the_command_writes_a_new_folder(
     assert "out: expected a new folder" in capsys.readouterr().err
     words = ["export", "universal", "--to", "crazyflie", "-o", str(tmp_path / "any")]
     assert main(words) == 1
-    assert "one vehicle of this machine, which --vehicle may name" in capsys.readouterr().err
+    assert "expected one craft (--vehicle), got drawn" in capsys.readouterr().err
     assert main([*words, "--vehicle", "hummingbird"]) == 0
     assert not main([*words[:3], "c", "-o", str(tmp_path / "any.h"), "--vehicle", "heavy_hexa"])
     assert b"rotorgram" in (tmp_path / "any.h").read_bytes()
+    words = ["export", str(file), "--to", "crazyflie", "--vehicle", "hummingbird"]
+    assert main(words) == 1
+    assert "a policy of the level wrench, which means the same to" in capsys.readouterr().err
 
 
 def test_the_header_has_the_numbers_of_the_rotors() -> None:

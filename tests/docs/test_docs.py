@@ -6,9 +6,11 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
+import collisions
 import pandas as pd
 import pytest
 import robust
+import shipped
 import universal
 from rotorgram.envs.config import EnvConfig
 from rotorgram.envs.registry import env_spec
@@ -297,15 +299,24 @@ def test_the_table_of_laps_has_what_was_flown() -> None:
     check("tasks", *rows)
 
 
-@pytest.mark.parametrize(("name", "study"), [("robust", robust), ("universal", universal)])
-def test_the_page_of_robust_policies_has_what_every_flight_says(
-    name: str, study: ModuleType, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize(
+    ("where", "study"),
+    [
+        ("robustness", robust),
+        ("robustness", universal),
+        ("robustness", shipped),
+        ("swarms", collisions),
+    ],
+    ids=lambda value: getattr(value, "__name__", value),
+)
+def test_a_page_has_what_every_flight_says(
+    where: str, study: ModuleType, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(RESULTS.parent.parent)
     found = study.sums()
-    committed = result(name)
+    committed = result(study.__name__)
     assert {key: committed[key] for key in found} == found
-    check("robustness", *(" ".join(row.split()) for row in study.page(found).splitlines()))
+    check(where, *(" ".join(row.split()) for row in study.page(found).splitlines()))
 
 
 def crashes_of(found: dict[str, Any]) -> str:

@@ -41,7 +41,7 @@ static const float mix[] = ROTORGRAM_MIX;               /* N by N m, a row of 3 
 static const float share[] = ROTORGRAM_SHARE;           /* of the collective thrust */
 static const float collective[] = ROTORGRAM_COLLECTIVE; /* its ends, N */
 static const float lead[] = ROTORGRAM_LEAD;
-static float wanted[ROTORGRAM_ROTORS]; /* thrusts, N */
+static float asked[ROTORGRAM_ROTORS]; /* thrusts, N */
 #endif
 
 /* What a rotor's speed still lacks of its command after a step, as a share: rising and falling. */
@@ -145,9 +145,10 @@ static struct seen look(const sensorData_t *sensors, const state_t *state)
     into_frame(axes, velocity, seen.velocity);
     into_frame(axes, axes[0], seen.nose);
     into_frame(axes, axes[2], seen.thrust_axis);
+    const float c = cosf(heading), s = sinf(heading);
     for (int i = 0; i < 3; i++) {
         seen.up[i] = axes[i][2];
-        seen.wanted_nose[i] = cosf(heading) * axes[i][0] + sinf(heading) * axes[i][1];
+        seen.wanted_nose[i] = c * axes[i][0] + s * axes[i][1];
     }
     seen.rates[0] = sensors->gyro.x * RADIANS;
     seen.rates[1] = sensors->gyro.y * RADIANS;
@@ -168,12 +169,18 @@ static struct seen look(const sensorData_t *sensors, const state_t *state)
 }
 
 #ifdef ROTORGRAM_WRENCH
-/* Thrusts of a collective thrust and a torque. Roll and pitch come first, scaled down alike where they span more than the rotors'
- * range; the collective thrust moves as little as makes room for them; yaw gets the room that is left. */
+/* Thrusts of a collective thrust and a torque. Roll and pitch come first, scaled down alike where they span
+ * more than the rotors' range; the collective thrust moves as little as makes room for them; yaw gets the
+ * room that is left. */
 static void mixed(float thrust_sum, const float torque[3])
 {
-    const float low = collective[0], high = collective[1];
+    const float low = collective[0];
+    float high = collective[1];
     float part[ROTORGRAM_ROTORS], lower = 0.0f, upper = 0.0f, yaw = torque[2];
+#ifdef THRUST_MAX /* what the battery compensation can hold */
+    for (int i = 0; i < ROTORGRAM_ROTORS; i++)
+        high = fminf(high, THRUST_MAX / share[i]);
+#endif
     for (int i = 0; i < ROTORGRAM_ROTORS; i++) {
         part[i] = mix[3 * i] * torque[0] + mix[3 * i + 1] * torque[1];
         lower = i == 0 ? part[i] : fminf(lower, part[i]);
@@ -181,18 +188,18 @@ static void mixed(float thrust_sum, const float torque[3])
     }
     const float scale = fminf((high - low) / fmaxf(upper - lower, 1e-9f * high), 1.0f);
     const float middle = fminf(fmaxf(thrust_sum, low - scale * lower), high - scale * upper);
-    float least = -INFINITY, most = INFINITY; /* of yaw */
+    float first = -INFINITY, last = INFINITY; /* of yaw */
     for (int i = 0; i < ROTORGRAM_ROTORS; i++) {
         const float by = mix[3 * i + 2];
         part[i] = middle + scale * part[i];
         if (by != 0.0f) {
-            least = fmaxf(least, fminf((low - part[i]) / by, (high - part[i]) / by));
-            most = fminf(most, fmaxf((low - part[i]) / by, (high - part[i]) / by));
+            first = fmaxf(first, fminf((low - part[i]) / by, (high - part[i]) / by));
+            last = fminf(last, fmaxf((low - part[i]) / by, (high - part[i]) / by));
         }
     }
-    yaw = fminf(fmaxf(yaw, least), most); /* where there is no room, the upper end holds */
+    yaw = fminf(fmaxf(yaw, first), last); /* where there is no room, the upper end holds */
     for (int i = 0; i < ROTORGRAM_ROTORS; i++)
-        wanted[i] = share[i] * (part[i] + mix[3 * i + 2] * yaw);
+        asked[i] = share[i] * (part[i] + mix[3 * i + 2] * yaw);
 }
 #endif
 
@@ -211,7 +218,8 @@ static void act(const sensorData_t *sensors, const state_t *state)
 #ifdef ROTORGRAM_WRENCH
     float torque[3];
     for (int i = 0; i < 3; i++)
-        torque[i] = torque_of[3 * i] * action[1] + torque_of[3 * i + 1] * action[2] + torque_of[3 * i + 2] * action[3];
+        torque[i] = torque_of[3 * i] * action[1] + torque_of[3 * i + 1] * action[2] +
+                    torque_of[3 * i + 2] * action[3];
     mixed(lift[0] + lift[1] * action[0], torque);
 #else
     for (int i = 0; i < ROTORGRAM_ROTORS; i++) {
@@ -226,7 +234,7 @@ static void drive(void)
 {
     for (int i = 0; i < ROTORGRAM_ROTORS; i++) {
 #ifdef ROTORGRAM_WRENCH
-        command[i] = within(thrust[i] + lead[0] * (wanted[i] - thrust[i]), least[i], largest[i]);
+        command[i] = within(thrust[i] + lead[0] * (asked[i] - thrust[i]), least[i], largest[i]);
 #endif
 #ifdef THRUST_MAX /* what the battery compensation can hold */
         command[i] = within(command[i], least[i], THRUST_MAX);
