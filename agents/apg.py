@@ -38,7 +38,7 @@ class APGConfig(Config):
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.anneal_clip:
-            raise InputError("anneal_clip: expected false where rewards are derived, got true")
+            raise InputError("anneal_clip: expected false with the derivative of rewards, got true")
 
 
 class APG(Learner):
@@ -111,15 +111,20 @@ class APG(Learner):
                 goes_on = ~rollout.ends[step - 1, :, np.newaxis]
                 by_observations[step - 1] += goes_on * network.back(slope.T).T
         if config.most_of_one:
-            sizes = np.sqrt(np.square(slopes).sum(axis=(0, 2)))
-            fine = np.isfinite(sizes)
-            if fine.any():  # else training diverged
-                most = config.most_of_one * np.median(sizes[fine])
-                large = fine & (sizes > most)
-                slopes[:, large] *= (most / sizes[large])[:, np.newaxis]
-                slopes[:, ~fine] = 0.0
-                self.terms["bounded"] = np.mean(large | ~fine)
+            self._bound(slopes, config.most_of_one)
         return slopes
+
+    def _bound(self, slopes: Floats, most_of_one: float) -> None:
+        """Scale each drone's slopes (T, N, k) down, as `most_of_one` says."""
+        sizes = np.sqrt(np.square(slopes).sum(axis=(0, 2)))
+        fine = np.isfinite(sizes)
+        if not fine.any():  # training diverged, which is raised later
+            return
+        most = most_of_one * np.median(sizes[fine])
+        large = fine & (sizes > most)
+        slopes[:, large] *= (most / sizes[large])[:, np.newaxis]
+        slopes[:, ~fine] = 0.0
+        self.terms["bounded"] = np.mean(large | ~fine)
 
     def beyond(self, rollout: Rollout) -> Floats:
         """Derivatives of the loss of what follows the rollout, by what an actor observes after each
@@ -131,25 +136,25 @@ class APG(Learner):
 
 @immutable
 class SHACConfig(APGConfig):
-    """Short-horizon actor-critic (Xu et al. 2022). Defaults: where it says so, the paper's."""
+    """Short-horizon actor-critic (Xu et al. 2022). Defaults: where it says so, theirs."""
 
     horizon: int = 32
-    """Steps of each drone in an update, through which it differentiates (appendix A.2.2)."""
+    """Steps of each drone in an update, through which it differentiates (Xu et al.)."""
     gae_lambda: Share = 0.95
-    """Lambda of the values that the critic learns (appendix A.2.2)."""
+    """Lambda of the values that the critic learns (Xu et al.)."""
     critic_learning_rate: Positive | None = None
     """Of the critic's weights; null: the same."""
     epochs: PositiveInt = 2
     """Passes of the critic over a rollout."""
     minibatches: PositiveInt = 4
-    """Parts of a rollout, each for one step of the critic (appendix A.2.2)."""
+    """Parts of a rollout, each for one step of the critic."""
 
 
 class SHAC(APG):
-    """Short-horizon actor-critic: a flight that goes on counts with its value, Equation 5.
+    """Short-horizon actor-critic: a flight that goes on counts with its value.
 
-    The critic descends the squared error to TD(λ), Equation 7, after the actor's step. Not as in
-    the paper: it has no target network, Adam has its usual constants, the noise stays as large, and
+    The critic descends the squared error to TD(λ), after the actor's gradient. Not as in the
+    article: it has no target network, Adam has its usual constants, the noise stays as large, and
     an episode may end at any step of a rollout, where powers of gamma run on.
     """
 
@@ -158,12 +163,12 @@ class SHAC(APG):
     def __init__(self, log: EpisodeRecorder, config: SHACConfig, seed: int) -> None:
         super().__init__(log, config, seed)
         self._critic = make_network(self._actor.spec.observation, 1, config)
-        self._judge = Weights.zeros(self._critic.shapes)
-        self._critic.bind(self._judge)
+        self._critic_weights = Weights.zeros(self._critic.shapes)
+        self._critic.bind(self._critic_weights)
         self._critic.initialise(self._rng, 1.0)
-        self._adam = Adam(self._judge, self.epsilon)
-        self._arrays["critic"] = self._judge.values
-        self._arrays |= named("critic.optimizer.", self._adam.state)
+        self._critic_optimizer = Adam(self._critic_weights, self.epsilon)
+        self._arrays["critic"] = self._critic_weights.values
+        self._arrays |= named("critic.optimizer.", self._critic_optimizer.state)
 
     def gradient(self, rollout: Rollout) -> None:
         """That of APG, with values; then the critic learns."""
@@ -182,7 +187,8 @@ class SHAC(APG):
         seen = rollout.rows(rollout.observations)
         targets = rollout.rows((values + found).astype(np.float32))
         self.terms |= {"values": rollout.rows(values), "targets": targets}
-        rate = self.rate * (config.critic_learning_rate or config.learning_rate)
+        own_rate = config.critic_learning_rate or config.learning_rate
+        rate = self.rate * own_rate / config.learning_rate
         for _ in range(config.epochs):
             order = self._rng.permutation(len(targets))
             for chosen in np.array_split(order, min(config.minibatches, len(order))):
@@ -190,8 +196,8 @@ class SHAC(APG):
                 self.terms["value_loss"] = np.square(errors).mean()
                 errors *= 2 / len(chosen)
                 self._critic.learn(errors)
-                clip_norm(self._judge.slopes, config.max_grad_norm)
-                self._adam.step(rate / config.learning_rate)
+                clip_norm(self._critic_weights.slopes, config.max_grad_norm)
+                self._critic_optimizer.step(rate)
 
     def beyond(self, rollout: Rollout) -> Floats:
         """Of the value where a flight goes on, after the last step and after a truncation."""

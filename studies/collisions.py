@@ -23,7 +23,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from measuring import RESULTS, options, table, write
+from measuring import RESULTS, options, table, write_sums
 from rotorgram.agents import find_controller, load
 from rotorgram.envs import LocalVectorEnv
 from rotorgram.envs.config import EnvConfig
@@ -162,11 +162,7 @@ def main() -> None:
         orca_flights=200,
         only_sums=False,
     ).parse_args()
-    if not args.only_sums:
-        measure(args)
-    result = sums()
-    write(FILE, result)
-    print(page(result))
+    write_sums(args, FILE, measure, sums, page)
 
 
 if __name__ == "__main__":

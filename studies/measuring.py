@@ -143,6 +143,21 @@ def read_rows(path: Path, kind: type[Value]) -> list[Value]:
     return [kind(**{name: types[name](text) for name, text in row.items()}) for row in rows]
 
 
+def write_sums(
+    args: argparse.Namespace,
+    path: Path,
+    measure: Callable[[Any], None],
+    sums: Callable[[], dict[str, Any]],
+    page: Callable[[dict[str, Any]], str],
+) -> None:
+    """Fly, unless `--only-sums` is given; write the sums of all flights, and print their table."""
+    if not args.only_sums:
+        measure(args)
+    result = sums()
+    write(path, result)
+    print(page(result))
+
+
 def write(path: Path, result: Mapping[str, object]) -> None:
     """Write a result as JSON, with the software and the machine on which it depends."""
     from rotorgram.models.files import software_versions

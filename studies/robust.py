@@ -23,7 +23,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from measuring import RESULTS, options, table, write
+from measuring import RESULTS, options, table, write_sums
 from rotorgram.agents import find_preset
 from rotorgram.cli._env import UNIVERSAL
 from rotorgram.envs.config import EnvConfig
@@ -189,11 +189,7 @@ def main() -> None:
     vehicles = ["crazyflie2", "hummingbird", "paper"]
     args = options(__doc__, vehicles=vehicles, seeds=5, first_seed=700, flights=1000,
                    pilots=list(PILOTS), only_sums=False).parse_args()  # fmt: skip
-    if not args.only_sums:
-        measure(args)
-    result = sums()
-    write(FILE, result)
-    print(page(result))
+    write_sums(args, FILE, measure, sums, page)
 
 
 if __name__ == "__main__":

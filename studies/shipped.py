@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from measuring import RESULTS, options, table, write
+from measuring import RESULTS, options, table, write_sums
 from rotorgram.agents import load
 from rotorgram.cli._env import UNIVERSAL
 from rotorgram.envs.config import EnvConfig
@@ -115,11 +115,7 @@ def page(result: dict[str, Any]) -> str:
 def main() -> None:
     parser = options(__doc__, flights=200, policies=list(policies()), only_sums=False)
     args = parser.parse_args()
-    if not args.only_sums:
-        measure(args)
-    result = sums()
-    write(FILE, result)
-    print(page(result))
+    write_sums(args, FILE, measure, sums, page)
 
 
 if __name__ == "__main__":

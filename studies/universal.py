@@ -25,7 +25,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from measuring import RESULTS, options, table, write
+from measuring import RESULTS, options, table, write_sums
 from rotorgram.agents import find_controller, load
 from rotorgram.agents.checkpoints import store
 from rotorgram.cli._env import CHECKPOINT, UNIVERSAL
@@ -254,11 +254,7 @@ def _shown(cell: dict[str, Any] | None) -> str:
 def main() -> None:
     args = options(__doc__, seeds=5, first_seed=900, flights=1000, env_steps=40_000_000, peers=100,
                    only_sums=False).parse_args()  # fmt: skip
-    if not args.only_sums:
-        measure(args)
-    result = sums()
-    write(FILE, result)
-    print(page(result))
+    write_sums(args, FILE, measure, sums, page)
 
 
 if __name__ == "__main__":

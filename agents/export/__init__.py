@@ -52,8 +52,8 @@ def on_vehicle(checkpoint: Checkpoint, vehicle: str) -> Checkpoint:
     env = checkpoint.env
     if env is None or env.action != "wrench":
         raise InputError(
-            "vehicle: expected none but for a policy of the level wrench, which means the same to "
-            f"every craft, got {vehicle}"
+            "vehicle: expected a policy of the level wrench, whose actions mean the same to every "
+            f"craft, got {env.action if env else 'one that does not know its env'}"
         )
     lags = Vehicle.load(vehicle).coefficients["rotors.time_constant"]
     effects = {**env.effects.to_options(), "motor_lag": bool(lags)}

@@ -209,13 +209,15 @@ def test_if_no_derivative_is_a_number_training_has_diverged() -> None:
     config = SHACConfig(horizon=4, most_of_one=3.0)
     agent, log = agent_of(drones=4, config=config)
     assert isinstance(agent, SHAC)
-    agent._judge.values[...] = np.nan
+    agent._critic_weights.values[...] = np.nan
     with pytest.raises(Diverged, match="weights are not finite after update 1"):
         agent.train(log, 64, lambda: True)
 
 
 def test_a_bound_of_rewards_that_grows_is_refused() -> None:
-    with pytest.raises(InputError, match="anneal_clip: expected false where rewards are derived"):
+    with pytest.raises(
+        InputError, match="anneal_clip: expected false with the derivative of rewards"
+    ):
         APGConfig(reward_clip=8.0, anneal_clip=True)
 
 
@@ -223,7 +225,7 @@ def valued(steps: int, **options: Any) -> tuple[SHAC, Rollout]:
     """As `climbing`, and V(s) is 3 s/m times the speed upwards plus 6."""
     agent, rollout = climbing(steps, SHACConfig, **options)
     assert isinstance(agent, SHAC)
-    judge = agent._judge.arrays
+    judge = agent._critic_weights.arrays
     for array in judge.values():
         array[...] = 0.0
     judge["layers.0.weight"][0, [0, 6]] = (2.0, 1.0)  # the bias, and the sixth number
