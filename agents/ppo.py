@@ -93,14 +93,13 @@ class PPO(A2C):
 
     def columns(self, rollout: Rollout) -> list[Floats]:
         """As of A2C, and log-probabilities by the policy that flew."""
-        own = self.sequences(rollout, 0)
         columns = super().columns(rollout)
-        actions = columns[1]
-        *lead, size = actions.shape
-        observations = rollout.observations if own else rollout.rows(rollout.observations)
-        rows = observations.reshape(-1, observations.shape[-1])
-        outputs = self._actor.network.forward(rows.T, own)
-        before, _ = self._actor.head.score(outputs, actions.reshape(-1, size).T)
+        flown = [rollout.outputs, rollout.actions]
+        if not self.config.memory:
+            flown = [rollout.rows(column) for column in flown]
+        *lead, _ = flown[0].shape
+        outputs, actions = (column.reshape(-1, column.shape[-1]).T for column in flown)
+        before, _ = self._actor.head.score(outputs, actions)
         return [*columns, before.reshape(lead)]
 
     def objective(  # type: ignore[override]

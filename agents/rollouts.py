@@ -36,6 +36,8 @@ class Rollout:
     """Of the policy's memory before the first row, shape (H, N)."""
     observations: Floats
     """Shape (T, N, n)."""
+    outputs: Floats
+    """Of the policy's network as it flew: shape (T, N, k)."""
     actions: Floats
     """As drawn, not clipped: shape (T, N, k); (T, N, 1) if discrete."""
     rewards: Numbers
@@ -148,7 +150,7 @@ class Collector:
             if not len(rows) % block:
                 drawn = self.policy.head.noise(self.rng, block * count)
                 noise = drawn.reshape(block, count, -1)
-            outputs = self.policy.outputs(observations)
+            outputs = self.policy.outputs(observations).copy()
             actions = self.policy.head.sample(outputs, noise[len(rows) % block])
             if not np.isfinite(actions).all():
                 raise Diverged("actions are not finite")
@@ -160,7 +162,7 @@ class Collector:
                 log.fly(actions, None, idle)
             after = log.observations
             ends = (env.terminated, env.truncated, flying, env.lost)
-            rows.append((observations, actions, env.rewards, after, *ends))
+            rows.append((observations, outputs, actions, env.rewards, after, *ends))
             if memory:
                 memory.forget(env.terminated | env.truncated | env.lost | ~flying)
             observations = after

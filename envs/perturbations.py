@@ -7,6 +7,7 @@ from typing import Any
 
 from ..models.errors import InputError
 from ..models.files import read_own_toml
+from ..models.vehicle import Vehicle
 from ..sim import PARAMETERS
 from .config import EnvConfig
 from .spec import Values
@@ -17,8 +18,11 @@ _OF_ONE_CRAFT = ("lag", "lag_low", "lag_high", "way", "kg", "impulse")
 """Numbers of a size that are those of one vehicle."""
 
 
-def perturbed(config: EnvConfig, name: str, size: float) -> tuple[EnvConfig, Values]:
-    """The env with what a perturbation switches on, and the distributions of what it draws.
+def perturbed(
+    config: EnvConfig, name: str, size: float, draws: str = "randomize"
+) -> tuple[EnvConfig, Values]:
+    """The env with what a perturbation switches on, and the distributions of what it draws: those
+    in its table under `draws`.
 
     Raises `InputError` for an env that cannot have it.
     """
@@ -28,7 +32,7 @@ def perturbed(config: EnvConfig, name: str, size: float) -> tuple[EnvConfig, Val
     own = [size for size in _OF_ONE_CRAFT if f"{{{size}}}" in str(table)]
     if own and hasattr(vehicle, "table"):
         raise InputError(f"{name}: expected one craft, as drawn:7, got the pool {vehicle.name}")
-    numbers = _numbers(config, table, size)
+    numbers = _numbers(config, vehicle, table, size)
     changes: Values = {}
     for field in ("effects", "sensors", "events", "task"):
         if field in table:
@@ -49,7 +53,7 @@ def perturbed(config: EnvConfig, name: str, size: float) -> tuple[EnvConfig, Val
     if "backend" in table:
         changes["backend"] = table["backend"]
     changed = config.changed(**changes) if changes else config
-    return changed, _filled(table.get("randomize", {}), numbers)
+    return changed, _filled(table.get(draws, {}), numbers)
 
 
 def together(
@@ -62,14 +66,14 @@ def together(
     refused = {}
     for name, size in sizes.items():
         try:
-            changed, _ = perturbed(config, name, size)
-            check(changed)
+            changed, own = perturbed(config, name, size, "together")
+            if changed is not config:
+                check(changed)
         except InputError as error:
             refused[name] = str(error)
             continue
-        table = PERTURBATIONS[name]
         config = changed
-        drawn |= _filled(table["together"], _numbers(config, table, size))
+        drawn |= own
     return config, drawn, refused
 
 
@@ -98,9 +102,8 @@ def check(config: EnvConfig) -> None:
     LocalVectorEnv(config, config.drones).close()
 
 
-def _numbers(config: EnvConfig, table: Values, size: float) -> dict[str, float]:
+def _numbers(config: EnvConfig, vehicle: Vehicle, table: Values, size: float) -> dict[str, float]:
     """What texts of a table stand for, by name."""
-    vehicle = config.load_vehicle()
     coefficients = vehicle.coefficients
     mass = float(vehicle.mass)
     period = config.control_period or 1.0

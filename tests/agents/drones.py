@@ -29,13 +29,17 @@ def cases(name: str) -> Any:
 
 
 def rollout(name: str = "three steps", **changes: np.ndarray) -> Rollout:
-    """Steps of one drone, of a table of such a name, with other columns by name."""
+    """Steps of one drone, of a table of such a name, with other columns by name.
+
+    Unless they are given, outputs are the actions, as of a policy that draws none.
+    """
     table = {key: np.array(column, np.float32) for key, column in cases("rollouts")[name].items()}
     never = np.zeros(len(table["rewards"]), bool)
     flags = {"truncated": never, "kept": ~never, "terminated": table.pop("terminated") == 1}
     rewards = table.pop("rewards").astype(float)
     state = np.zeros(0, np.float32)
     columns = {"state": state, **table, **flags, "rewards": rewards, **changes}
+    columns.setdefault("outputs", columns["actions"])
     return Rollout(**{key: column[:, np.newaxis] for key, column in columns.items()})
 
 

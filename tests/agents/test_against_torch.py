@@ -45,8 +45,8 @@ def agent_of(algorithm: str, *, discrete: bool) -> Any:
     )
 
 
-def rollout(rng: np.random.Generator, *, discrete: bool) -> Rollout:
-    """Random transitions, a few of which end an episode."""
+def rollout(agent: Any, rng: np.random.Generator, *, discrete: bool) -> Rollout:
+    """Random transitions, a few of which end an episode, by the outputs of the policy of now."""
     lead = (STEPS, DRONES)
     seen = rng.standard_normal((STEPS + 1, DRONES, 3), dtype=np.float32)
     actions = rng.standard_normal((*lead, 3), dtype=np.float32)
@@ -54,9 +54,11 @@ def rollout(rng: np.random.Generator, *, discrete: bool) -> Rollout:
         actions = rng.integers(3, size=(*lead, 1)).astype(np.float32)
     ends = rng.random((2, *lead)) < 0.1
     rewards = rng.normal(size=lead)
+    rows = seen[:-1].reshape(-1, 3)
     return Rollout(
         np.zeros((0, lead[1]), np.float32),
         seen[:-1],
+        agent._actor.network.forward(rows.T).T.reshape(*lead, -1).copy(),
         actions,
         rewards,
         seen[1:],
@@ -147,7 +149,7 @@ def test_a_hundred_updates_are_those_of_torch(algorithm: str, discrete: bool) ->
 
         agent.minibatch = both
     while agent.optimizer.steps < 100:
-        data = rollout(rng, discrete=discrete)
+        data = rollout(agent, rng, discrete=discrete)
         if algorithm == "vpg":
             columns = data.rows(data.observations), data.rows(data.actions)
             reference.returns(*columns, agent.returns(data))

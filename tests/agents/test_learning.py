@@ -170,7 +170,8 @@ def train_both(
         flown = {name: np.array(rows) for name, rows in zip(names, columns, strict=True)}
         env.results.clear()
         kept = np.ones(len(flown["rewards"]), bool)
-        given = rollout(**seen, **flown, kept=kept)
+        outputs = ours._actor.network.forward(seen["observations"].T).T.copy()
+        given = rollout(**seen, **flown, kept=kept, outputs=outputs)
         ours.update(given)
         told.append((ours.scalars(), theirs.scalars()))
         return True
