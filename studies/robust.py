@@ -83,13 +83,16 @@ def trained(vehicle: str, preset: str, seed: int, folder: Path) -> float:
 
 
 def flown(pilot: str, cells: list[Cell], flights: int, **options: object) -> np.ndarray:
-    """Steady errors of the flights of each cell, mm, uint16, shape (cells, flights)."""
+    """Steady errors of the flights of each cell, mm, uint16, shape (cells, flights).
+
+    They come after as many flights with which the preset was chosen.
+    """
     changed = [Cell(**{**vars(cell), "config": cell.config.changed(**options)}) for cell in cells]
     file = str(UNIVERSAL) if pilot == "universal" else pilot
-    rows = fly(jobs_of(file, changed, flights), WorkersConfig(), lambda *_: None)
+    rows = fly(jobs_of(file, changed, 2 * flights), WorkersConfig(), lambda *_: None)
     found = []
     for cell in cells:
-        own = rows[(rows["row"] == cell.row) & (rows["size"] == cell.size)]
+        own = rows[(rows["row"] == cell.row) & (rows["size"] == cell.size)].tail(flights)
         steady = np.minimum(np.rint(1000 * own["steady"].to_numpy()), CRASHED - 1)
         found.append(np.where(own["crashed"], CRASHED, steady).astype(np.uint16))
     return np.array(found)
