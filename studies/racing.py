@@ -4,15 +4,16 @@
     OMP_NUM_THREADS=1 python studies/racing.py [--tasks Racing Waypoints Gates] [--seeds 20]
         [--first-seed 9320] [--flights 1000] [--again] [--out docs/results/racing.json]
 
-Each seed is a training by `rotorgram train ppo`, from process start to its end, with the preset
-`tuned`. Its policy, and `geometric`, fly `--flights` starts of the set `final`, on `rigid`: the
-same starts for all, of no training. Seeds 9100 to 9102 chose the preset, with starts of the set
-`tuning`; tests train none. Seeds 5000 to 5009 of the file are the policies of the board, which
-`rotorgram benchmark` trained alike: their time of training is not known.
+Each seed is a training by `rotorgram train ppo` with `WORDS`, from process start to its end. Its
+policy, and `geometric`, fly `--flights` starts of the set `final`, on `rigid`: the same starts for
+all, of no training. Seeds 9100 to 9102 chose the settings; tests train none. Seeds 5000 to 5009 of
+Racing are the policies of the board, which `rotorgram benchmark` trained alike: their time of
+training is not known.
 
 A lap is the time from the start, at rest, to the end of the control step that passes the last gate
 or point. The bound of each flight is the least time of a point mass through the same openings or
-balls in their order, from the same start: see `least_time`. A crash is an end with gates or points
+balls in their order, from the same start: see `least_time.py`. There, the least time of the craft
+itself is found from the flights of the first training. A crash is an end with gates or points
 left before the time is up.
 
 Rows of all flights are kept in the file beside the result, `racing_flights.npz`. Seeds that it has
@@ -24,12 +25,14 @@ It takes about an hour of one core for both courses in the air.
 
 import statistics
 import tempfile
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
+from least_time import of_craft, of_point_mass
 from measuring import RESULTS, options, write
 from rotorgram.agents import find_controller, load
 from rotorgram.envs import LocalVectorEnv
@@ -42,117 +45,21 @@ from seconds import train
 
 WORDS: Final = {
     "Racing": [],
-    "Waypoints": [],
+    "Waypoints": ["--env-steps", "20000000", "--set", "activation=relu", "reach=3",
+                  "minibatches=32"],
     "Gates": ["--scene", "gates:0-63"],
-}
-"""Words of `rotorgram train` by task. Solid gates are flown in layouts that no training has seen.
+}  # fmt: skip
+"""Words of `rotorgram train` by task; the preset of Waypoints is for a shorter training. Solid
+gates are flown in layouts that no training has seen.
 """
+FIRST: Final = {"Waypoints": 2000}
+"""Number of the first start: those before it chose the words of Waypoints."""
 FLOWN: Final = {"Gates": {"scene": "gates:unseen"}}
-NODES: Final = 10
-"""Times in which the thrust may change on the way to each gate or point. 40 lower the bound of a
-track of ours by at most 0.1 %.
-"""
-SHORTEST: Final = 0.01  # s: of the way to a gate or point
-LONGEST: Final = 20.0
-ASIDE: Final = 0.1  # m/s²: of the first thrusts, since upright is a saddle of some courses
-GUESSES: Final = 8.0, 4.0, 16.0  # m/s²: accelerations with which IPOPT begins, until one leads on
+TIMED: Final = 40
+"""Flights of which the least time of the craft is found."""
 
 Floats = npt.NDArray[np.float64]
 Rows = dict[str, np.ndarray]
-LeastTime = Callable[[Floats, Floats], float]
-
-
-# ---- the bound
-
-
-def least_time(
-    goals: int, gates: bool, lift: float, gravity: float, nodes: int = NODES
-) -> LeastTime:
-    """The least time of a point mass from rest through some goals, in their order, s.
-
-    The function takes the start, m, shape (3,), and the goals. A gate is its center, x and y of its
-    direction and half its size, shape (goals, 6): it is passed anywhere in its opening, not against
-    its direction. A point is its place and its radius, shape (goals, 4). Thrust over mass has any
-    direction and at most the size `lift`, m/s². It changes `nodes` times on the way to each goal,
-    at even times. Speed is free at the end, and nothing turns. IPOPT, by casadi, finds the times,
-    the thrusts and the states at the goals; raises `RuntimeError` if it does not.
-    """
-    import casadi as ca
-
-    width = 6 if gates else 4
-    course = ca.MX.sym("course", 3 + goals * width)
-    position = course[:3]
-    velocity = ca.MX.zeros(3)
-    falls = ca.DM([0.0, 0.0, -gravity])
-    left = ca.DM(np.arange(nodes, 0, -1) - 0.5)  # of the way, in parts, after a part's middle
-    unknown, low, high = [], [], []
-    terms, least, most = [], [], []
-    total = 0.0
-    for goal in range(goals):
-        time = ca.MX.sym(f"time {goal}")
-        thrust = ca.MX.sym(f"thrust {goal}", 3, nodes)
-        state = ca.MX.sym(f"state {goal}", 6)
-        unknown += [time, ca.vec(thrust), state]
-        low += [[SHORTEST], np.full(3 * nodes, -lift), np.full(6, -np.inf)]
-        high += [[LONGEST], np.full(3 * nodes, lift), np.full(6, np.inf)]
-        part = time / nodes
-        arrives = position + time * velocity + time**2 / 2 * falls
-        arrives += part**2 * ca.mtimes(thrust, left)
-        speed = velocity + time * falls + part * ca.sum2(thrust)
-        terms += [ca.sum1(thrust**2).T / lift**2, ca.vertcat(arrives, speed) - state]
-        least += [np.zeros(nodes), np.zeros(6)]
-        most += [np.ones(nodes), np.zeros(6)]
-        position, velocity = state[:3], state[3:]
-        target = course[3 + goal * width :][:width]
-        away = position - target[:3]
-        if gates:
-            c, s, half = target[3], target[4], target[5]
-            ahead = c * away[0] + s * away[1]
-            aside = c * away[1] - s * away[0]
-            forward = c * velocity[0] + s * velocity[1]
-            terms += [ahead, aside / half, away[2] / half, forward]
-            least += [[0.0, -1.0, -1.0, 0.0]]
-            most += [[0.0, 1.0, 1.0, np.inf]]
-        else:
-            terms.append(ca.sumsqr(away) / target[3] ** 2)
-            least.append([0.0])
-            most.append([1.0])
-        total += time
-    problem = {"x": ca.vertcat(*unknown), "p": course, "f": total, "g": ca.vertcat(*terms)}
-    quiet = {"print_time": False, "ipopt.print_level": 0, "ipopt.sb": "yes"}
-    solver = ca.nlpsol("least_time", "ipopt", problem, quiet)
-    bounds = dict(
-        zip(
-            ("lbx", "ubx", "lbg", "ubg"), map(np.concatenate, (low, high, least, most)), strict=True
-        )
-    )
-
-    def solve(start: Floats, targets: Floats) -> float:
-        for acceleration in GUESSES:
-            guess = first_guess(start, targets[:, :3], nodes, acceleration, gravity)
-            found = solver(x0=guess, p=np.concatenate((start, targets.ravel())), **bounds)
-            if solver.stats()["success"]:
-                return float(found["f"])
-        raise RuntimeError(f"least_time: {solver.stats()['return_status']} from {start}")
-
-    return solve
-
-
-def first_guess(
-    start: Floats, places: Floats, nodes: int, acceleration: float, gravity: float
-) -> Floats:
-    """Where IPOPT begins: along straight lines, with this acceleration to the middle of each."""
-    course = np.vstack((start, places))
-    parts = []
-    for goal, way in enumerate(np.diff(course, axis=0), 1):
-        far = float(np.linalg.norm(way)) + 1e-3
-        seconds = 2 * np.sqrt(far / acceleration)
-        ahead = course[min(goal + 1, len(places))] - course[goal - 1]
-        velocity = ahead / (np.linalg.norm(ahead) + 1e-3) * far / seconds
-        halves = np.where(np.arange(nodes) < nodes / 2, 1.0, -1.0)[:, np.newaxis]
-        thrust = halves * way / far * acceleration + np.array((ASIDE, ASIDE, gravity))
-        parts += [[seconds], thrust.ravel(), course[goal], velocity]
-    return np.concatenate(parts)
 
 
 # ---- flights
@@ -163,7 +70,26 @@ def made(task: str, flights: int, **keywords: object) -> tuple[LocalVectorEnv, l
     given = {"backend": "rigid", **FLOWN.get(task, {}), **keywords}
     config = EnvConfig.from_keywords(f"rotorgram/{task}-v0", **given)
     env = LocalVectorEnv(config, flights, autoreset_mode="Disabled")
-    return env, [evaluation_seed(flight, "final") for flight in range(flights)]
+    first = FIRST.get(task, 0)
+    return env, [evaluation_seed(first + flight, "final") for flight in range(flights)]
+
+
+def courses_of(env: LocalVectorEnv, task: str) -> Floats:
+    """The gates or points of each flight, as `least_time` has them, shape (flights, goals, ...)."""
+    options = env.config.task
+    kept = env.snapshot()
+    if task == "Racing":
+        track, _ = read_track(options["track"])
+        turns = np.radians([gate.heading for gate in track])
+        centers = np.array([gate.position for gate in track])
+        halves = np.array([gate.size / 2 for gate in track])
+        course = np.column_stack((centers, np.cos(turns), np.sin(turns), halves))
+        return np.broadcast_to(course, (env.num_envs, *course.shape))
+    if task == "Gates":
+        return kept["record/memory/track"][:, 0].astype(float)
+    points = kept["record/memory/points"][:, 0]
+    radii = np.full((*points.shape[:2], 1), options["radius"])
+    return np.concatenate((points, radii), axis=2).astype(float)
 
 
 def bounds_of(task: str, flights: int) -> Floats:
@@ -171,32 +97,42 @@ def bounds_of(task: str, flights: int) -> Floats:
     env, seeds = made(task, flights)
     env.reset(seed=seeds)
     starts = env.telemetry["position"]
-    kept = env.snapshot()
-    options = env.config.task
-    if task == "Racing":
-        track, _ = read_track(options["track"])
-        turns = np.radians([gate.heading for gate in track])
-        centers = np.array([gate.position for gate in track])
-        halves = np.array([gate.size / 2 for gate in track])
-        courses = np.column_stack((centers, np.cos(turns), np.sin(turns), halves))[np.newaxis]
-    elif task == "Gates":
-        courses = kept["record/memory/track"][:, 0]
-    else:
-        points = kept["record/memory/points"][:, 0]
-        radii = np.full((*points.shape[:2], 1), options["radius"])
-        courses = np.concatenate((points, radii), axis=2)
-    env.close()
+    courses = courses_of(env, task)
     vehicle = Vehicle.load(*env.config.vehicle)
+    env.close()
     lift = float(vehicle.thrust_high @ vehicle.allocation[0]) / vehicle.mass
-    least = least_time(courses.shape[1], task != "Waypoints", lift, vehicle.gravity)
-    every = np.broadcast_to(courses, (flights, *courses.shape[1:]))
-    return np.array([least(*one) for one in zip(starts, every.astype(float), strict=True)])
+    least = of_point_mass(*courses.shape[1:], lift, vehicle.gravity)
+    return np.array([least(*one) for one in zip(starts, courses, strict=True)])
 
 
-def fly(task: str, agent: Any, flights: int) -> Rows:
+def craft_of(task: str, agent: Any, flights: int) -> Floats:
+    """The least time of the craft, s, from each flight of a policy; nan where there is none."""
+    env, seeds = made(task, flights)
+    env.reset(seed=seeds)
+    courses = courses_of(env, task)
+    vehicle = Vehicle.load(*env.config.vehicle)
+    least = of_craft(vehicle, *courses.shape[1:])
+    log: list[Rows] = []
+    rows = fly(task, agent, flights, log)
+    names = ("position", "velocity", "attitude", "body_rates")
+    found = np.full(flights, np.nan)
+    for flight in np.flatnonzero(rows["left"] == 0):
+        flown = log[: int(rows["steps"][flight]) + 1]
+        states = np.array([np.concatenate([row[name][flight] for name in names]) for row in flown])
+        thrusts = np.array([row["thrust"][flight] for row in flown])
+        left = np.array([row["left"][flight] for row in flown])
+        ends = np.flatnonzero(np.diff(left)) + 1
+        with suppress(RuntimeError):
+            found[flight] = least(states, thrusts, ends, env.config.control_period, courses[flight])
+    env.close()
+    return found
+
+
+def fly(task: str, agent: Any, flights: int, log: list[Rows] | None = None) -> Rows:
     """What each flight leaves out, its control steps, and whether it crashes, shape (flights,).
 
-    `agent` is a `Checkpoint`, or the name of a controller.
+    `agent` is a `Checkpoint`, or the name of a controller. A `log` gets the telemetry of the start
+    and of each step, and what is `left`.
     """
     options: Mapping[str, object] = {}
     if isinstance(agent, str):
@@ -211,6 +147,12 @@ def fly(task: str, agent: Any, flights: int) -> Rows:
     crashed = np.zeros(flights, bool)
     done = np.zeros(flights, bool)
     env.reset(seed=seeds)
+
+    def keep() -> None:
+        if log is not None:
+            log.append({**env.telemetry, "left": env.headline.copy()})
+
+    keep()
     while not done.all():
         seen = env.observations
         if isinstance(agent, str):
@@ -218,6 +160,7 @@ def fly(task: str, agent: Any, flights: int) -> Rows:
         else:
             actions = policy.actions.to_envs(policy.outputs(seen))
         env.advance(actions, frozen=done)
+        keep()
         steps += ~done
         ended = (env.terminated | env.truncated) & ~done
         left[ended] = env.headline[ended]
@@ -266,6 +209,10 @@ def result_of(kept: Mapping[str, np.ndarray], task: str) -> dict[str, object]:
     ]
     together = {name: column.ravel() for name, column in rows(slice(len(seeds))).items()}
     ratios = [one.get("lap_over_bound", np.inf) for one in of_seeds]
+    least = kept[f"{task}/craft"]
+    timed = (kept[f"{task}/left"][:-1, : len(least)] == 0) & np.isfinite(least)
+    laps = period * kept[f"{task}/steps"][:-1, : len(least)]
+    craft = np.broadcast_to(least, laps.shape)[timed].mean()
     return {
         "command": " ".join(["rotorgram train ppo --env", f"rotorgram/{task}-v0", *WORDS[task]]),
         "seeds_without_a_miss": sum(one["left"] == 0 for one in of_seeds),
@@ -275,6 +222,8 @@ def result_of(kept: Mapping[str, np.ndarray], task: str) -> dict[str, object]:
         "all": figures(together, period),
         "lap_over_bound": {"best": min(ratios), "median": statistics.median(ratios),
                            "worst": max(ratios)},
+        "craft": {"flights": int(np.isfinite(least).sum()), "least": round(float(craft), 3),
+                  "lap_over_least": round(float(laps[timed].mean() / craft), 3)},
         "geometric": figures(rows(-1), period),
         "seeds": of_seeds,
     }  # fmt: skip
@@ -321,7 +270,10 @@ def add(kept: Rows, task: str, seed: int, flights: int) -> None:
     with tempfile.TemporaryDirectory() as folder:
         run = Path(folder) / "run"
         seconds = train(words, seed, run)["processor_seconds"]
-        flown = fly(task, load(run / "checkpoint.safetensors"), flights)
+        policy = load(run / "checkpoint.safetensors")
+        if f"{task}/craft" not in kept:
+            kept[f"{task}/craft"] = craft_of(task, policy, min(TIMED, flights))
+        flown = fly(task, policy, flights)
     kept[f"{task}/seeds"] = np.append(kept[f"{task}/seeds"], seed)
     kept[f"{task}/seconds"] = np.append(kept[f"{task}/seconds"], seconds)
     for name, column in flown.items():

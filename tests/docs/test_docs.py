@@ -286,12 +286,14 @@ def test_the_table_of_laps_has_what_was_flown() -> None:
         low, high = 100 * crashes["low"], 100 * crashes["high"]
         ratios = found["lap_over_bound"]
         beside = found["geometric"]
+        craft = found["craft"]
         cells = (
             f"{found['seeds_without_a_miss']} of {found['of']}",
             f"{flown['not_whole']} of {flown['flights']:,}",
             f"{crashes['crashes']} ({low:.2g} to {high:.2g} %)",
             f"{found['bound']:.2f} s",
             f"{ratios['median']:.2f} ({ratios['best']:.2f} to {ratios['worst']:.2f})",
+            f"{craft['lap_over_least']:.2f}",
             f"{beside['not_whole']}, {beside['lap_over_bound']:.2f}",
             f"{found['processor_seconds']:.0f} s",
         )
