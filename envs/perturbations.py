@@ -3,14 +3,16 @@
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from ..models.errors import InputError
 from ..models.files import read_own_toml
-from ..models.vehicle import Vehicle
 from ..sim import PARAMETERS
 from .config import EnvConfig
 from .spec import Values
+
+if TYPE_CHECKING:
+    from ..models.vehicle import Vehicle
 
 PERTURBATIONS = read_own_toml(__file__, "perturbations")
 """Tables by name."""
@@ -102,7 +104,7 @@ def check(config: EnvConfig) -> None:
     LocalVectorEnv(config, config.drones).close()
 
 
-def _numbers(config: EnvConfig, vehicle: Vehicle, table: Values, size: float) -> dict[str, float]:
+def _numbers(config: EnvConfig, vehicle: "Vehicle", table: Values, size: float) -> dict[str, float]:
     """What texts of a table stand for, by name."""
     coefficients = vehicle.coefficients
     mass = float(vehicle.mass)

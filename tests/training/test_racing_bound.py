@@ -8,7 +8,8 @@ from bounds import course_time
 
 pytest.importorskip("casadi")
 
-from racing import least_time
+from least_time import of_craft, of_point_mass
+from rotorgram.models.vehicle import Vehicle
 
 LIFT, GRAVITY = 20.0, 9.8
 LEVEL = math.sqrt(LIFT**2 - GRAVITY**2)  # largest acceleration at one height
@@ -25,7 +26,7 @@ def gate(ahead: float, aside: float, direction: float = 1.0) -> tuple[float, ...
 def through_points(*ways: tuple[float, float, float]) -> float:
     """Least time from the start to places this far from it, in their order."""
     targets = np.array([(*(START + way), SMALL) for way in ways])
-    return least_time(len(ways), False, LIFT, GRAVITY)(START, targets)
+    return of_point_mass(len(ways), 4, LIFT, GRAVITY)(START, targets)
 
 
 @pytest.mark.parametrize(
@@ -51,7 +52,7 @@ def test_up_and_back_is_bang_bang() -> None:
 
 def test_a_gate_is_passed_at_its_nearest_corner_below() -> None:
     """Thrust of one direction: |way · 2 / t² + gravity| is the lift, a quadratic for 2 / t²."""
-    found = least_time(1, True, LIFT, GRAVITY)(START, np.array([gate(4.0, 2.0)]))
+    found = of_point_mass(1, 6, LIFT, GRAVITY)(START, np.array([gate(4.0, 2.0)]))
     squared = 4.0**2 + 1.5**2 + 0.5**2
     falls = 0.5 * GRAVITY
     acceleration = (falls + math.sqrt(falls**2 + squared * LEVEL**2)) / squared
@@ -60,7 +61,7 @@ def test_a_gate_is_passed_at_its_nearest_corner_below() -> None:
 
 def test_a_gate_is_not_passed_against_its_direction() -> None:
     """The way back through the gate needs another turn."""
-    solve = least_time(2, True, LIFT, GRAVITY)
+    solve = of_point_mass(2, 6, LIFT, GRAVITY)
     last = gate(8.0, 0.0)
     along = solve(START, np.array([gate(4.0, 0.0), last]))
     against = solve(START, np.array([gate(4.0, 0.0, -1.0), last]))
@@ -72,5 +73,30 @@ def test_it_lies_above_the_bound_of_single_directions() -> None:
     places = START + dice.uniform(-3.0, 3.0, (4, 3))
     weaker = course_time(np.vstack((START, places)), np.full(4, 0.3), LIFT, GRAVITY)
     targets = np.column_stack((places, np.full(4, 0.3)))
-    found = least_time(4, False, LIFT, GRAVITY)(START, targets)
+    found = of_point_mass(4, 4, LIFT, GRAVITY)(START, targets)
     assert weaker < found < 2 * weaker
+
+
+def flight_of(position: np.ndarray, steps: int) -> tuple[np.ndarray, np.ndarray]:
+    """States and thrusts of a craft that hovers: where a search may begin."""
+    state = np.concatenate((position, np.zeros(3), (1.0, 0.0, 0.0, 0.0), np.zeros(3)))
+    return np.tile(state, (steps + 1, 1)), np.full((steps + 1, 4), 49.0)
+
+
+def test_the_craft_climbs_by_all_its_thrust() -> None:
+    vehicle = Vehicle.load()
+    states, thrusts = flight_of(START, 100)
+    targets = np.array([(*(START + np.array((0.0, 0.0, 10.0))), SMALL)])
+    found = of_craft(vehicle, 1, 4)(states, thrusts, np.array([100]), 0.02, targets)
+    acceleration = vehicle.thrust_high.sum() / vehicle.mass - vehicle.gravity
+    assert found == pytest.approx(math.sqrt(2 * (10.0 - SMALL) / acceleration), rel=1e-3)
+
+
+def test_the_craft_needs_longer_than_a_point_where_it_has_to_turn() -> None:
+    vehicle = Vehicle.load()
+    states, thrusts = flight_of(START, 100)
+    targets = np.array([(*(START + np.array((5.0, 0.0, 0.0))), 0.3)])
+    lift = vehicle.thrust_high.sum() / vehicle.mass
+    point = of_point_mass(1, 4, lift, vehicle.gravity)(START, targets)
+    found = of_craft(vehicle, 1, 4)(states, thrusts, np.array([100]), 0.02, targets)
+    assert 1.05 * point < found < 2 * point
