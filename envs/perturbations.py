@@ -21,10 +21,10 @@ _OF_ONE_CRAFT = ("lag", "lag_low", "lag_high", "way", "kg", "impulse")
 
 
 def perturbed(
-    config: EnvConfig, name: str, size: float, draws: str = "randomize"
+    config: EnvConfig, name: str, size: float, *, alone: bool = True
 ) -> tuple[EnvConfig, Values]:
-    """The env with what a perturbation switches on, and the distributions of what it draws: those
-    in its table under `draws`.
+    """The env with what a perturbation switches on, and the distributions of what it draws, alone
+    or together with others.
 
     Raises `InputError` for an env that cannot have it.
     """
@@ -55,7 +55,8 @@ def perturbed(
     if "backend" in table:
         changes["backend"] = table["backend"]
     changed = config.changed(**changes) if changes else config
-    return changed, _filled(table.get(draws, {}), numbers)
+    draws = table.get("randomize", {}) if alone else table["together"]
+    return changed, _filled(draws, numbers)
 
 
 def together(
@@ -68,7 +69,7 @@ def together(
     refused = {}
     for name, size in sizes.items():
         try:
-            changed, own = perturbed(config, name, size, "together")
+            changed, own = perturbed(config, name, size, alone=False)
             if changed is not config:
                 check(changed)
         except InputError as error:

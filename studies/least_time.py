@@ -1,5 +1,5 @@
-"""Least times through gates or points in their order, by casadi and IPOPT: of a point mass, which
-nothing turns, and of the craft itself, with its rotors and its inertia.
+"""Least times through gates or points in their order, by casadi and IPOPT: of a point mass, whose
+thrust turns at once, and of the craft itself, with its rotors and its inertia.
 
 A gate is its center, x and y of its direction and half its size: it is passed anywhere in its
 opening, not against its direction. A point is its place and its radius. Speed is free at the end.
@@ -24,14 +24,20 @@ GUESSES: Final = 8.0, 4.0, 16.0  # m/s²: accelerations with which IPOPT begins,
 PARTS: Final = 2  # steps of RK4 between two changes of the thrusts
 
 Floats = npt.NDArray[np.float64]
+Limit = float | Floats
 LeastTime = Callable[[Floats, Floats], float]
 
 
 class Problem:
-    """The unknowns of a course, and what must hold; the least total time solves it."""
+    """The unknowns of a flight along a course, and the constraints on them. The solution has the
+    least total time.
+
+    Attributes:
+        course: What differs from flight to flight: its start, then the gates or points.
+    """
 
     def __init__(self, numbers: int) -> None:
-        """A course has so many numbers."""
+        """`numbers` is the size of `course`."""
         self.course = ca.MX.sym("course", numbers)
         self._unknown: list[Any] = []
         self._limits: list[tuple[Floats, Floats]] = []
@@ -39,11 +45,12 @@ class Problem:
         self._ranges: list[tuple[Floats, Floats]] = []
         self._total = 0.0
 
-    def unknown(self, rows: int, columns: int, low: float, high: float) -> Any:
-        """Unknowns between two limits, shape (rows, columns)."""
+    def unknown(self, rows: int, columns: int, low: Limit, high: Limit) -> Any:
+        """Unknowns between two limits, of all or of each row, shape (rows, columns)."""
         found = ca.MX.sym("unknown", rows, columns)
         self._unknown.append(ca.vec(found))
-        self._limits.append((np.full(rows * columns, low), np.full(rows * columns, high)))
+        least, most = (np.tile(np.broadcast_to(limit, rows), columns) for limit in (low, high))
+        self._limits.append((least, most))
         return found
 
     def time(self) -> Any:
@@ -157,10 +164,10 @@ def straight(
 def of_craft(vehicle: Vehicle, goals: int, width: int, nodes: int = NODES) -> Callable[..., float]:
     """The least time of a rigid craft without drag, whose rotors change their thrust at once.
 
-    The function takes a flight, with which IPOPT begins: states, shape (T + 1, 13), position,
-    velocity, attitude and body rates; thrusts before each, shape (T + 1, R); the row in which each
-    gate or point is passed; the control period, s; and the targets, shape (goals, width). It finds
-    the best flight of that kind: another way round may be faster.
+    The function takes a flight, with which IPOPT begins: the states, shape (T + 1, 13), of
+    position, velocity, attitude and body rates; the thrusts that led to each, shape (T + 1, R); the
+    row in which each gate or point is passed; the control period, s; and the gates or points, shape
+    (goals, width). What it finds is a local optimum: another way round may be faster.
     """
     rotors = vehicle.num_rotors
     problem = Problem(13 + goals * width)
@@ -177,7 +184,7 @@ def of_craft(vehicle: Vehicle, goals: int, width: int, nodes: int = NODES) -> Ca
     state = problem.course[:13]
     for goal in range(goals):
         time = problem.time()
-        thrust = problem.unknown(rotors, nodes, vehicle.thrust_low[0], vehicle.thrust_high[0])
+        thrust = problem.unknown(rotors, nodes, vehicle.thrust_low, vehicle.thrust_high)
         states = problem.unknown(13, nodes, -np.inf, np.inf)
         before = ca.horzcat(state, states[:, :-1])
         problem.need(step(before, thrust, ca.repmat(time / nodes, 1, nodes)) - states, 0.0, 0.0)
@@ -193,22 +200,23 @@ def of_craft(vehicle: Vehicle, goals: int, width: int, nodes: int = NODES) -> Ca
         for begin, end in zip((0, *ends[:-1]), ends, strict=True):
             rows = begin + np.arange(1, 2 * nodes + 1) * (end - begin) / (2 * nodes)
             later = np.minimum(np.ceil(rows), len(states) - 1).astype(int)
-            guess += [[(end - begin) * period], thrusts[later[::2]].ravel(),
-                      states[later[1::2]].ravel()]  # fmt: skip
+            middles, nexts = later[::2], later[1::2]
+            guess += [[(end - begin) * period], thrusts[middles].ravel(), states[nexts].ravel()]
         return solve(np.concatenate(guess), np.concatenate((states[0], targets.ravel())))
 
     return least
 
 
 def slope(vehicle: Vehicle, state: Any, thrusts: Any) -> Any:
-    """The derivative of a state by time, as MuJoCo turns: the attitude is w, x, y, z."""
+    """The derivative of a state by time. The attitude is a quaternion w, x, y, z."""
     velocity, attitude, rates = state[3:6], state[6:10], state[10:13]
     w, x, y, z = ca.vertsplit(attitude)
     wrench = ca.mtimes(ca.DM(vehicle.allocation), thrusts)
     up = ca.vertcat(2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y))
     falls = ca.DM([0.0, 0.0, -vehicle.gravity])
     inertia = ca.DM(vehicle.inertia)
-    moment = wrench[1:] - ca.cross(rates, ca.mtimes(inertia, rates))
+    momentum = ca.mtimes(inertia, rates)
+    moment = wrench[1:] - ca.cross(rates, momentum)
     scalar = -(x * rates[0] + y * rates[1] + z * rates[2])
     vector = w * rates + ca.cross(attitude[1:], rates)
     turn = ca.vertcat(scalar, vector) / 2

@@ -49,8 +49,8 @@ PILOTS = (*PRESETS, *OPTIONS)
 
 
 def cells_of(vehicle: str) -> list[Cell]:
-    """Without a perturbation, with each that the vehicle can have, and with all, within 8 m of the
-    goal.
+    """Without a perturbation, with each that the vehicle can have, and with all. Flights end 8 m
+    from the goal.
     """
     sizes = dict(find_preset("ppo", "robust", TASK).perturbations)
     config = EnvConfig.from_keywords(TASK, vehicle=vehicle, backend="rigid")
@@ -85,14 +85,15 @@ def trained(vehicle: str, preset: str, seed: int, folder: Path) -> float:
 def flown(pilot: str, cells: list[Cell], flights: int, **options: object) -> np.ndarray:
     """Steady errors of the flights of each cell, mm, uint16, shape (cells, flights).
 
-    They come after as many flights with which the preset was chosen.
+    As many others are flown first and left out: their starts chose the preset.
     """
     changed = [Cell(**{**vars(cell), "config": cell.config.changed(**options)}) for cell in cells]
     file = str(UNIVERSAL) if pilot == "universal" else pilot
     rows = fly(jobs_of(file, changed, 2 * flights), WorkersConfig(), lambda *_: None)
     found = []
     for cell in cells:
-        own = rows[(rows["row"] == cell.row) & (rows["size"] == cell.size)].tail(flights)
+        own = rows[(rows["row"] == cell.row) & (rows["size"] == cell.size)]
+        own = own.tail(flights)
         steady = np.minimum(np.rint(1000 * own["steady"].to_numpy()), CRASHED - 1)
         found.append(np.where(own["crashed"], CRASHED, steady).astype(np.uint16))
     return np.array(found)

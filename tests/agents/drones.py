@@ -31,7 +31,7 @@ def cases(name: str) -> Any:
 def rollout(name: str = "three steps", **changes: np.ndarray) -> Rollout:
     """Steps of one drone, of a table of such a name, with other columns by name.
 
-    Unless they are given, outputs are the actions, as of a policy that draws none.
+    Unless they are given, outputs are the actions, as of a policy without noise.
     """
     table = {key: np.array(column, np.float32) for key, column in cases("rollouts")[name].items()}
     never = np.zeros(len(table["rewards"]), bool)

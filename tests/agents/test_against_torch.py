@@ -46,7 +46,7 @@ def agent_of(algorithm: str, *, discrete: bool) -> Any:
 
 
 def rollout(agent: Any, rng: np.random.Generator, *, discrete: bool) -> Rollout:
-    """Random transitions, a few of which end an episode, by the outputs of the policy of now."""
+    """Random transitions, a few of which end an episode, as the policy flies before an update."""
     lead = (STEPS, DRONES)
     seen = rng.standard_normal((STEPS + 1, DRONES, 3), dtype=np.float32)
     actions = rng.standard_normal((*lead, 3), dtype=np.float32)

@@ -210,6 +210,8 @@ def test_what_is_learnt_from_is_what_was_flown(script: Script) -> None:
             done[drone] = len(rows_flown)
             found = outputs[rollout.kept[:, drone], drone]
             np.testing.assert_allclose(found, np.array(expected), rtol=1e-4, atol=1e-5)
+            kept = rollout.outputs[rollout.kept[:, drone], drone]
+            np.testing.assert_allclose(kept, np.array(expected), rtol=1e-4, atol=1e-5)
 
 
 @pytest.mark.parametrize("script", [CALM, LOSSES, CALM[:1]], ids=["calm", "losses", "one"])

@@ -7,10 +7,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from drones import log_of, rollout
+from drones import log_of, rollout, vector
 from nets import arrays_of
 from rotorgram.agents import PPOConfig, find_preset, load
+from rotorgram.agents.episodes import EpisodeRecorder
 from rotorgram.agents.ppo import PPO
+from rotorgram.agents.rollouts import Collector
 from rotorgram.cli import main
 from rotorgram.models.errors import InputError
 
@@ -27,6 +29,18 @@ def test_rates_of_actor_and_critic() -> None:
         moved = np.abs(array - before[name])[np.abs(gradients[name]) > 1e-3]
         rate = 0.03 if name.startswith("critic.") else 0.01
         np.testing.assert_allclose(moved, rate, rtol=0.01, err_msg=name)
+
+
+def test_probabilities_before_an_update_are_those_of_the_policy_that_flew() -> None:
+    log = EpisodeRecorder(vector(3), seed=0)
+    agent = PPO(log, replace(SMALL, steps_per_update=90), 0)
+    data = agent.collect(Collector(log, np.random.default_rng(0), agent._actor), 90)
+    *_, before = agent.columns(data)
+    rows = data.rows(data.observations)
+    outputs = agent._actor.network.forward(rows.T)
+    expected, _ = agent._actor.head.score(outputs, data.rows(data.actions).T)
+    assert before.std() > 0.1
+    np.testing.assert_allclose(before, expected, rtol=1e-4, atol=1e-5)
 
 
 def test_every_epoch_takes_every_transition_once() -> None:

@@ -86,7 +86,8 @@ def flight_of(position: np.ndarray, steps: int) -> tuple[np.ndarray, np.ndarray]
 def test_the_craft_climbs_by_all_its_thrust() -> None:
     vehicle = Vehicle.load()
     states, thrusts = flight_of(START, 100)
-    targets = np.array([(*(START + np.array((0.0, 0.0, 10.0))), SMALL)])
+    above = START + np.array((0.0, 0.0, 10.0))
+    targets = np.array([(*above, SMALL)])
     found = of_craft(vehicle, 1, 4)(states, thrusts, np.array([100]), 0.02, targets)
     acceleration = vehicle.thrust_high.sum() / vehicle.mass - vehicle.gravity
     assert found == pytest.approx(math.sqrt(2 * (10.0 - SMALL) / acceleration), rel=1e-3)
@@ -95,7 +96,8 @@ def test_the_craft_climbs_by_all_its_thrust() -> None:
 def test_the_craft_needs_longer_than_a_point_where_it_has_to_turn() -> None:
     vehicle = Vehicle.load()
     states, thrusts = flight_of(START, 100)
-    targets = np.array([(*(START + np.array((5.0, 0.0, 0.0))), 0.3)])
+    ahead = START + np.array((5.0, 0.0, 0.0))
+    targets = np.array([(*ahead, 0.3)])
     lift = vehicle.thrust_high.sum() / vehicle.mass
     point = of_point_mass(1, 4, lift, vehicle.gravity)(START, targets)
     found = of_craft(vehicle, 1, 4)(states, thrusts, np.array([100]), 0.02, targets)
