@@ -37,8 +37,9 @@ class APGConfig(Config):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.anneal_clip:
-            raise InputError("anneal_clip: expected false with the derivative of rewards, got true")
+        for name in ("anneal_clip", "squashed"):
+            if getattr(self, name):
+                raise InputError(f"{name}: expected false with the derivative of rewards, got true")
 
 
 class APG(Learner):

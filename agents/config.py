@@ -48,9 +48,12 @@ class Config:
     """Raise `reward_clip` over the run: to twice as much at its half, to ten times at 9/10."""
     log_std: Annotated[float, LOG_STD] = -0.5
     """Initial logarithm of the policy's standard deviation, in units of the action."""
+    squashed: bool = False
+    """Bound continuous actions by tanh, after the noise. A cut at their bounds makes a policy fly
+    otherwise with noise than without."""
 
-    squashed: ClassVar[bool] = False
-    """Whether the policy bounds its output by tanh."""
+    draws: ClassVar[bool] = True
+    """Whether the policy's weights have a standard deviation."""
     remembers: ClassVar[bool] = True
     """Whether the algorithm trains a memory."""
 
@@ -99,8 +102,10 @@ class SACConfig(RolloutConfig):
     Defaults: its Table 1.
     """
 
-    squashed = True
+    draws = False
     remembers = False
+    squashed: bool = True
+    """As in the paper."""
     hidden: tuple[int, ...] = (256, 256)
     """Units of each hidden layer of each network."""
     learning_rate: float = 0.0003

@@ -50,6 +50,7 @@ class Learner:
         self.terms: dict[str, Any] = {}
         weights_seed, self._rng = seeds_of(seed)
         self._actor = actor = NetworkPolicy(log.spec, config)
+        log.actions = actor.actions
         copies = len(log.spec.agents) if self.central else 1
         seen = copies * log.spec.observation if self.has_critic else actor.spec.observation
         self._both = make_network(seen, actor.actions.outputs, config)

@@ -9,7 +9,7 @@ from ..envs.spec import ArraySpec, Discrete, EnvSpec
 from ..models.errors import InputError
 from .config import Config
 from .heads import Categorical, Gaussian, Head
-from .layers import Floats, Module, Parts, Tanh, Weights
+from .layers import Floats, Layer, Module, Parts, Tanh, Weights
 from .networks import make_network
 
 Array = np.ndarray
@@ -61,7 +61,8 @@ class ActionMap:
 
     Of a continuous action the network's 0 is the middle between the bounds, -1 the lower and 1 the
     upper one; where there is no bound, it is the number itself. Of a discrete action the network
-    gives a number for each choice. An array of whole numbers raises `InputError`.
+    gives a number for each choice. An array of whole numbers raises `InputError`. A map that is
+    `squashed` takes tanh of the network's numbers.
 
     Attributes:
         outputs: Numbers that the network gives.
@@ -73,8 +74,9 @@ class ActionMap:
         high: Upper bound.
     """
 
-    def __init__(self, action: ArraySpec | Discrete) -> None:
+    def __init__(self, action: ArraySpec | Discrete, *, squashed: bool = False) -> None:
         self.discrete = isinstance(action, Discrete)
+        self.squashed = squashed and not self.discrete
         if isinstance(action, Discrete):
             self.outputs = action.choices
             self.size = 1
@@ -98,6 +100,8 @@ class ActionMap:
         """Drawn actions (N, k) as the env's: float32, (N, k), inside the bounds; or int64, (N,)."""
         if self.discrete:
             return actions[:, 0].astype(np.int64)
+        if self.squashed:
+            actions = np.tanh(actions)
         if not self._plain:
             actions = self.middle + self.half * actions
         clipped: Array = np.minimum(np.maximum(actions, self.low), self.high)
@@ -122,16 +126,20 @@ class NetworkPolicy(Module):
 
     def __init__(self, spec: EnvSpec, config: Config) -> None:
         self.spec = spec = spec.for_actor()
-        self.actions = ActionMap(spec.action)
+        self.actions = ActionMap(spec.action, squashed=config.squashed)
         outputs = self.actions.outputs
         self.network = make_network(spec.observation, outputs, config)
         self.memory = self.network.memory
-        self.head: Head = Head() if config.squashed else Gaussian(outputs)
+        self.head: Head = Gaussian(outputs) if config.draws else Head()
         if self.actions.discrete:
             self.head = Categorical(outputs)
         self.shapes = {**self.network.shapes, **self.head.shapes}
-        if config.squashed:
-            self.network.layers.append(Tanh())
+
+    @property
+    def layers(self) -> list[Layer]:
+        """From observations to numbers that a map without `squashed` takes."""
+        squashing = [Tanh()] if self.actions.squashed else []
+        return [*self.network.layers, *squashing]
 
     @classmethod
     def load(cls, weights: Parts, spec: EnvSpec, config: Config) -> "NetworkPolicy":

@@ -38,6 +38,8 @@ class PPOConfig(A2CConfig):
     """Change of an action's probability that the objective rewards (table 3)."""
     max_grad_norm: Positive = 0.5
     """The gradient, as one vector, is scaled down to this length."""
+    target_kl: Positive | None = None
+    """An update ends at a minibatch whose divergence is above 1.5 times it, nats; null: never."""
 
 
 class PPO(A2C):
@@ -73,23 +75,26 @@ class PPO(A2C):
             axis = 1
             choices = np.flatnonzero(rollout.kept.any(axis=0))
         minibatches = min(config.minibatches, len(choices))
+        parts = (
+            part
+            for _ in range(config.epochs)
+            for part in np.array_split(self._rng.permutation(choices), minibatches)
+        )
         self._changes: list[Floats] = []
         terms = []
-        for _ in range(config.epochs):
-            order = self._rng.permutation(choices)
-            for chosen in np.array_split(order, minibatches):
-                some = [column.take(chosen, axis=axis) for column in columns]
-                part = sequences.take(chosen) if sequences else None
-                terms.append(self.minibatch(*some, sequences=part))
-                clip_norm(self.weights.slopes, config.max_grad_norm)
-                self.optimizer.step(self.rate, scales)
+        for chosen in parts:
+            some = [column.take(chosen, axis=axis) for column in columns]
+            part = sequences.take(chosen) if sequences else None
+            terms.append(self.minibatch(*some, sequences=part))
+            if config.target_kl and divergences(self._changes[-1]).mean() > 1.5 * config.target_kl:
+                break
+            clip_norm(self.weights.slopes, config.max_grad_norm)
+            self.optimizer.step(self.rate, scales)
         means = np.mean(terms, axis=0).tolist()
         self.terms |= dict(zip(("gain", "entropy", "value_loss"), means, strict=True))
         changes = np.concatenate(self._changes)
-        growth = np.expm1(changes)
-        self.terms["clip_fraction"] = np.mean(np.abs(growth) > config.clip)
-        distances = growth - changes  # of KL, as SB3 estimates it
-        self.terms["approx_kl"] = distances[-len(rollout) :].mean()
+        self.terms["clip_fraction"] = np.mean(np.abs(np.expm1(changes)) > config.clip)
+        self.terms["approx_kl"] = divergences(changes[-len(rollout) :]).mean()
 
     def columns(self, rollout: Rollout) -> list[Floats]:
         """As of A2C, and log-probabilities by the policy that flew."""
@@ -117,6 +122,11 @@ class PPO(A2C):
         np.minimum(np.maximum(ratio, 1 - clip, out=ratio), 1 + clip, out=ratio)
         ratio *= advantage
         return np.minimum(gains, ratio), gains * (gains <= ratio)
+
+
+def divergences(changes: Floats) -> Floats:
+    """Of KL, as SB3 estimates it from changes of the log-probability."""
+    return np.expm1(changes) - changes
 
 
 class MAPPO(PPO):

@@ -156,8 +156,10 @@ class SB3Agent:
         if config.network != "mlp" or config.memory or config.reach:
             got = f"{config.network!r} with a memory of {config.memory} and reach {config.reach}"
             raise InputError(f"network: expected mlp without memory and reach with SB3, got {got}")
-        if config.anneal_clip:
-            raise InputError("anneal_clip: expected false with SB3, got true")
+        words = ("false", "true")
+        for name, own in {"anneal_clip": False, "squashed": isinstance(config, SACConfig)}.items():
+            if getattr(config, name) is not own:
+                raise InputError(f"{name}: expected {words[own]} with SB3, got {words[not own]}")
         if log.spec != log.spec.for_actor():
             raise InputError("sb3: expected no privileged arrays, which SB3's actor would see too")
         if any(scaled_in(log.spec.observation)):
@@ -287,4 +289,5 @@ def _settings(config: A2CConfig | SACConfig, rollout: int, log: EpisodeRecorder)
         "batch_size": -(-rollout // config.minibatches),
         "n_epochs": config.epochs,
         "clip_range": config.clip,
+        "target_kl": config.target_kl,
     }

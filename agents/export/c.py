@@ -155,7 +155,7 @@ class _Program:
         self.lines: list[str] = []
         self.at = "observation"
         self.size = flat_size(policy.spec)
-        write_layers(self, policy.network.layers)
+        write_layers(self, policy.layers)
         if policy.actions.discrete:
             self.lines.append("action[0] = 0.0f;")
             largest = f"{self.at}[(int)action[0]]"

@@ -139,7 +139,7 @@ def write(policy: NetworkPolicy, facts: Mapping[str, str]) -> bytes:
     size = flat_size(policy.spec)
     graph = _Graph(size)
     actions = policy.actions
-    write_layers(graph, policy.network.layers)
+    write_layers(graph, policy.layers)
     kind: int = TensorProto.INT64
     shape: list[str | int | None] = ["batch"]
     if actions.discrete:

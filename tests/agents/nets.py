@@ -58,11 +58,12 @@ def policy_of(
     activation: str = "relu",
     *,
     squash: bool = False,
+    **settings: Any,
 ) -> NetworkPolicy:
     """The policy of an MLP with as many layers and units as the weights have."""
     last = sum(name.startswith("layers.") for name in weights) - 1
     hidden = tuple(len(weights[f"layers.{i}.weight"]) for i in range(last))
-    config = config_of(hidden, activation, squash=squash)
+    config = config_of(hidden, activation, squash=squash, **settings)
     return NetworkPolicy.load(weights, spec, config)
 
 

@@ -214,11 +214,13 @@ def test_if_no_derivative_is_a_number_training_has_diverged() -> None:
         agent.train(log, 64, lambda: True)
 
 
-def test_a_bound_of_rewards_that_grows_is_refused() -> None:
-    with pytest.raises(
-        InputError, match="anneal_clip: expected false with the derivative of rewards"
-    ):
-        APGConfig(reward_clip=8.0, anneal_clip=True)
+@pytest.mark.parametrize(
+    ("name", "others"), [("anneal_clip", {"reward_clip": 8.0}), ("squashed", {})]
+)
+def test_what_it_cannot_differentiate_is_refused(name: str, others: dict[str, float]) -> None:
+    sentence = f"{name}: expected false with the derivative of rewards, got true"
+    with pytest.raises(InputError, match=sentence):
+        APGConfig(**{name: True}, **others)
 
 
 def valued(steps: int, **options: Any) -> tuple[SHAC, Rollout]:

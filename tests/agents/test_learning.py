@@ -189,12 +189,14 @@ PARITY = {
         max_grad_norm=0.5, **SETTINGS,
     ),
 }  # fmt: skip
+PARITY["ppo that stops"] = replace(PARITY["ppo"], target_kl=1e-4)
 
 
-@pytest.mark.parametrize("algorithm", PARITY)
-def test_sb3_and_ours_make_the_same_updates_of_the_same_experience(algorithm: str) -> None:
+@pytest.mark.parametrize("case", PARITY)
+def test_sb3_and_ours_make_the_same_updates_of_the_same_experience(case: str) -> None:
     """Of PPO as one minibatch. What they log agrees too."""
-    config = PARITY[algorithm]
+    config = PARITY[case]
+    algorithm = case.partition(" ")[0]
     env = Kept(episode_length=40, flight_band=1.1)
     log = EpisodeRecorder(env, seed=0)
     theirs: Any = make_agent(f"sb3-{algorithm}", log, config, 0)
@@ -213,7 +215,11 @@ def test_sb3_and_ours_make_the_same_updates_of_the_same_experience(algorithm: st
         assert here["train/value_loss"] == pytest.approx(there["train/value_loss"], rel=2e-3)
         distance = pytest.approx(there["train/approx_kl"], rel=0.02, abs=1e-5)
         assert here["train/approx_kl"] == distance
-    if algorithm == "ppo":  # the objective's bounds matter
+    steps = ours.optimizer.steps
+    if case == "ppo that stops":
+        assert 10 <= steps < 50
+    elif algorithm == "ppo":  # the objective's bounds matter
+        assert steps == 50
         fractions = [there["train/clip_fraction"] for _, there in updates]
         assert max(fractions) > 0.1
     assert any(e.truncated for e in log.episodes)

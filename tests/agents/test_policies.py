@@ -52,8 +52,12 @@ def test_outputs_are_squashed() -> None:
     found = policy.outputs(seen)
     np.testing.assert_allclose(found, [[20.8, 0.5]], rtol=1e-5)
     squashed = policy_of(layers, BOX, squash=True)
-    found = squashed.outputs(seen)
-    np.testing.assert_allclose(found, [[1, np.tanh(0.5)]], rtol=1e-5)
+    middle, half = squashed.actions.middle[0], squashed.actions.half[0]
+    expected = middle + half * np.array([1, np.tanh(0.5)])
+    np.testing.assert_allclose(squashed.act(seen[0]), expected, rtol=1e-5)
+    with_noise = policy_of(layers | {"log_std": noise}, BOX, squashed=True)
+    np.testing.assert_array_equal(with_noise.act(seen[0]), squashed.act(seen[0]))
+    assert not np.allclose(policy.act(seen[0]), squashed.act(seen[0]))
 
 
 DRAWS = 40_000

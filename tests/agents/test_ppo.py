@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from drones import log_of, rollout, vector
+from drones import Constant, log_of, rollout, vector
 from nets import arrays_of
 from rotorgram.agents import PPOConfig, find_preset, load
 from rotorgram.agents.episodes import EpisodeRecorder
@@ -41,6 +41,35 @@ def test_probabilities_before_an_update_are_those_of_the_policy_that_flew() -> N
     expected, _ = agent._actor.head.score(outputs, data.rows(data.actions).T)
     assert before.std() > 0.1
     np.testing.assert_allclose(before, expected, rtol=1e-4, atol=1e-5)
+
+
+def test_squashed_actions_are_flown_by_tanh_with_noise_and_without() -> None:
+    env = Constant()
+    log = EpisodeRecorder(env, seed=0)
+    agent = PPO(log, replace(SMALL, squashed=True, log_std=1.0), 0)
+    drawn = agent.collect(Collector(log, np.random.default_rng(0), agent._actor), 6).actions
+    assert np.abs(drawn).max() > 1
+    action = log.spec.action
+    low, high = (float(bound[0]) for bound in action.bounds())
+    expected = (low + high) / 2 + (high - low) / 2 * np.tanh(drawn[:, 0, 0])
+    np.testing.assert_allclose(env.flown[: len(expected)], expected, rtol=1e-5)
+    policy = agent.policy()
+    seen = np.ones(1, np.float32)
+    output = policy.outputs(seen[np.newaxis])[0, 0]
+    flown = (low + high) / 2 + (high - low) / 2 * np.tanh(output)
+    assert policy.act(seen)[0] == pytest.approx(flown)
+
+
+def test_an_update_ends_at_a_minibatch_that_is_too_far() -> None:
+    """The first minibatch is of the policy that flew, and the second one beyond any bound."""
+    config = replace(SMALL, steps_per_update=90, epochs=3, minibatches=4, learning_rate=0.1)
+    steps = []
+    for most in (None, 10.0, 1e-6):
+        log = EpisodeRecorder(vector(3), seed=0)
+        agent = PPO(log, replace(config, target_kl=most), 0)
+        agent.update(agent.collect(Collector(log, np.random.default_rng(0), agent._actor), 90))
+        steps.append(agent.optimizer.steps)
+    assert steps == [12, 12, 1]
 
 
 def test_every_epoch_takes_every_transition_once() -> None:

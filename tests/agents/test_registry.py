@@ -18,6 +18,7 @@ from rotorgram.agents import (
     store,
 )
 from rotorgram.agents.a2c import A2C
+from rotorgram.agents.config import SACConfig
 from rotorgram.agents.layers import Affine, Layer, Tanh
 from rotorgram.agents.networks import NETWORKS, Network
 from rotorgram.agents.registry import ALGORITHMS, Algorithm
@@ -129,6 +130,10 @@ def test_sb3_takes_its_own_networks_alone() -> None:
     growing = PPOConfig(reward_clip=2.0, anneal_clip=True)
     with pytest.raises(InputError, match="anneal_clip: expected false with SB3, got true"):
         make_agent("sb3-ppo", EpisodeRecorder(vector(), 0), growing, 0)
+    with pytest.raises(InputError, match="squashed: expected false with SB3, got true"):
+        make_agent("sb3-ppo", EpisodeRecorder(vector(), 0), PPOConfig(squashed=True), 0)
+    with pytest.raises(InputError, match="squashed: expected true with SB3, got false"):
+        make_agent("sb3-sac", EpisodeRecorder(vector(), 0), SACConfig(squashed=False), 0)
 
 
 def test_a_clip_of_rewards_grows_over_the_run() -> None:
