@@ -162,14 +162,16 @@ def test_every_perturbation_is_an_env_of_its_size() -> None:
 
 def test_a_training_draws_what_its_vehicle_has_and_says_what_not() -> None:
     config = EnvConfig.from_keywords(HOVER, backend="rigid", randomize={"mass": 1.1})
-    sizes = {"lighter": 20, "lag": 50, "action_delay": 20}
+    sizes = {"lighter": 20, "lag": 50, "action_delay": 20, "rotor": 10}
     env, refused = for_training(config, sizes)
-    assert env.randomize == {"mass": 1.1, "action_delay": "uniform(0, 1)"}
+    drawn = {"action_delay": "uniform(0, 1)", "thrust_1": "uniform(0.9, 1.1)"}
+    assert env.randomize == {"mass": 1.1, **drawn}
     assert list(refused) == ["lag"]
     assert "rotors.time_constant" in refused["lag"]
     _, drawn, refused = together(config.changed(vehicle="crazyflie2"), sizes)
     assert not refused
     assert drawn["mass"] == "uniform(0.8, 1.2)"
+    assert drawn["thrust_1"] == "uniform(0.9, 1.1)"
     assert drawn["time_constant"].startswith("loguniform(0.69")
 
 
