@@ -3,7 +3,7 @@
     python studies/collisions.py [--tasks Formation Crossing Escort] [--drones 4 8] [--seeds 5]
         [--first-seed 800] [--flights 1000] [--orca-flights 200] [--only-sums]
 
-For each task and seed `rotorgram train ippo --drones 4 --env.neighbours 3` trains a policy with its
+For each task and seed `rotorgram train ippo --drones 8 --env.neighbours 3` trains a policy with its
 preset; the clock runs from before the process starts to after it has ended. It then flies with each
 number of drones, whole episodes of the task, from starts that no training has seen, on `mujoco`.
 ORCA flies some starts of that kind.
@@ -35,7 +35,7 @@ FILE = RESULTS / "collisions.json"
 FLIGHTS = RESULTS / "collisions_flights.npz"
 ORCA = str(Path(__file__).parents[1] / "examples" / "orca.py") + ":Orca"
 NEIGHBOURS = 3
-TRAINED = 4  # drones of a world in training
+TRAINED = 8  # drones of a world in training
 CRASHED = 65535
 
 
