@@ -4,9 +4,9 @@
         [--first-seed 800] [--flights 1000] [--orca-flights 200] [--only-sums]
 
 For each task and seed `rotorgram train ippo --drones 8 --env.neighbours 3` trains a policy with its
-preset; the clock runs from before the process starts to after it has ended. It then flies with each
-number of drones, whole episodes of the task, from starts that no training has seen, on `mujoco`.
-ORCA flies some starts of that kind.
+preset, of Escort with four drones; the clock runs from before the process starts to after it has
+ended. It then flies with each number of drones, whole episodes of the task, from starts that no
+training has seen, on `mujoco`. ORCA flies some starts of that kind.
 `docs/results/collisions_flights.npz` gets the steady error of every flight in millimetres, 65535 of
 one that crashed, from which `--only-sums` computes `docs/results/collisions.json` again. Flights of
 other tasks stay in it.
@@ -35,14 +35,21 @@ FILE = RESULTS / "collisions.json"
 FLIGHTS = RESULTS / "collisions_flights.npz"
 ORCA = str(Path(__file__).parents[1] / "examples" / "orca.py") + ":Orca"
 NEIGHBOURS = 3
-TRAINED = 8  # drones of a world in training
+TRAINED = {"Formation": 8, "Crossing": 8, "Escort": 4}  # drones of a world in training
 CRASHED = 65535
 
 
 def trained(task: str, seed: int, folder: Path) -> float:
     """Train; wall time of the process, s."""
     words = ["train", "ippo", "--env", f"rotorgram/{task}-v0", "--vehicle", "crazyflie2"]
-    words += ["--drones", str(TRAINED), "--env.neighbours", str(NEIGHBOURS), "--seed", str(seed)]
+    words += [
+        "--drones",
+        str(TRAINED[task]),
+        "--env.neighbours",
+        str(NEIGHBOURS),
+        "--seed",
+        str(seed),
+    ]
     command = [sys.executable, "-m", "rotorgram.cli", *words, "--out", str(folder)]
     began = time.perf_counter()
     subprocess.run(command, check=True, stdout=subprocess.DEVNULL)

@@ -124,9 +124,9 @@ def test_the_tuned_preset_depends_on_the_task() -> None:
     assert (swarm.num_envs, swarm.env_steps, swarm.backend) == (1024, 12_000_000, "rigid")
     assert swarm.episode_length == 100
     for algorithm in ("ppo", "mappo"):
-        for task, most in (("Crossing", 2.0), ("Escort", 6.0)):
+        for task, most, squashed in (("Crossing", 2.0, True), ("Escort", 8.0, False)):
             other = find_preset(algorithm, "tuned", f"rotorgram/{task}-v0")
-            assert other.config == replace(swarm.config, reward_clip=most)
+            assert other.config == replace(swarm.config, reward_clip=most, squashed=squashed)
     with pytest.raises(InputError, match="preset: expected robust or tuned for ppo, got 'paper'"):
         find_preset("ppo", "paper")
 
