@@ -3,8 +3,8 @@
     python studies/collisions.py [--tasks Formation Crossing Escort] [--drones 4 8] [--seeds 5]
         [--first-seed 800] [--flights 1000] [--orca-flights 200] [--only-sums]
 
-For each task and seed `rotorgram train ippo --drones 8 --env.neighbours 3` trains a policy with its
-preset, of Escort with four drones; the clock runs from before the process starts to after it has
+For each task and seed `rotorgram train ippo --drones 4 --env.neighbours 3` trains a policy with its
+preset, of Crossing with eight drones; the clock runs from before the process starts to after it has
 ended. It then flies with each number of drones, whole episodes of the task, from starts that no
 training has seen, on `mujoco`. ORCA flies some starts of that kind.
 `docs/results/collisions_flights.npz` gets the steady error of every flight in millimetres, 65535 of
@@ -35,7 +35,7 @@ FILE = RESULTS / "collisions.json"
 FLIGHTS = RESULTS / "collisions_flights.npz"
 ORCA = str(Path(__file__).parents[1] / "examples" / "orca.py") + ":Orca"
 NEIGHBOURS = 3
-TRAINED = {"Formation": 8, "Crossing": 8, "Escort": 4}  # drones of a world in training
+TRAINED = {"Formation": 4, "Crossing": 8, "Escort": 4}  # drones of a world in training
 CRASHED = 65535
 
 
