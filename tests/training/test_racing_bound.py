@@ -8,7 +8,9 @@ from bounds import course_time
 
 pytest.importorskip("casadi")
 
-from least_time import of_craft, of_point_mass
+import casadi as ca
+from least_time import of_craft, of_point_mass, slope
+from rotorgram.envs import LocalVectorEnv
 from rotorgram.models.vehicle import Vehicle
 
 LIFT, GRAVITY = 20.0, 9.8
@@ -75,6 +77,31 @@ def test_it_lies_above_the_bound_of_single_directions() -> None:
     targets = np.column_stack((places, np.full(4, 0.3)))
     found = of_point_mass(4, 4, LIFT, GRAVITY)(START, targets)
     assert weaker < found < 2 * weaker
+
+
+@pytest.mark.parametrize(("name", "first"), [("paper", 0), ("skydio_x2", 6)])
+def test_the_craft_moves_as_in_the_simulator(name: str, first: int) -> None:
+    """Of `skydio_x2` its turns: the simulator slows it by drag."""
+    vehicle = Vehicle.load(name)
+    env = LocalVectorEnv("rotorgram/Hover-v0", 5, vehicle=name, action="rotors", backend="rigid")
+    env.reset(seed=3)
+    dice = np.random.default_rng(4)
+    state, thrust = ca.MX.sym("state", 13), ca.MX.sym("thrust", vehicle.num_rotors)
+    derivative = ca.Function("slope", [state, thrust], [slope(vehicle, state, thrust)])
+    names = ("position", "velocity", "attitude", "body_rates")
+    period, parts = env.config.control_period, 20
+    for _ in range(15):
+        before = np.column_stack([env.telemetry[own] for own in names])
+        env.advance(dice.uniform(-0.6, 0.6, (5, vehicle.num_rotors)).astype(np.float32))
+        after = np.column_stack([env.telemetry[own] for own in names])
+        for row, expected, thrusts in zip(before, after, env.telemetry["thrust"], strict=True):
+            for _ in range(parts):
+                half = row + period / parts / 2 * derivative(row, thrusts).full()[:, 0]
+                row = row + period / parts * derivative(half, thrusts).full()[:, 0]
+            row[6:10] /= np.linalg.norm(row[6:10])
+            np.testing.assert_allclose(row[first:], expected[first:], atol=2e-5)
+    assert np.abs(after[:, 10:]).max() > 1.0
+    env.close()
 
 
 def flight_of(position: np.ndarray, steps: int) -> tuple[np.ndarray, np.ndarray]:
