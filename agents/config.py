@@ -49,8 +49,8 @@ class Config:
     log_std: Annotated[float, LOG_STD] = -0.5
     """Initial logarithm of the policy's standard deviation, in units of the action."""
     squashed: bool = False
-    """Bound continuous actions by tanh, after the noise. A cut at their bounds makes a policy fly
-    otherwise with noise than without."""
+    """Bound continuous actions by tanh, after the noise. Cut at their bounds, actions have another
+    mean with noise than without it."""
 
     draws: ClassVar[bool] = True
     """Whether the policy's weights have a standard deviation."""

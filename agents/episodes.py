@@ -109,7 +109,7 @@ class EpisodeRecorder:
     `seed` is that of the run. With `keep_steps` every step is kept, for `steps`.
 
     Attributes:
-        actions: Map from a network's outputs to actions of the env.
+        actions: Map from a network's outputs to actions of the env. A learner sets its policy's.
         env_steps: Control steps of all drones together.
         out: Drones that wait for their next episode: bool, shape (N,).
         done: Drones whose whole world is out: these are to begin.

@@ -61,13 +61,13 @@ class ActionMap:
 
     Of a continuous action the network's 0 is the middle between the bounds, -1 the lower and 1 the
     upper one; where there is no bound, it is the number itself. Of a discrete action the network
-    gives a number for each choice. An array of whole numbers raises `InputError`. A map that is
-    `squashed` takes tanh of the network's numbers.
+    gives a number for each choice. An array of whole numbers raises `InputError`.
 
     Attributes:
         outputs: Numbers that the network gives.
         size: Numbers of a drawn action, k: 1 if discrete.
         discrete: Whether an action is a choice.
+        squashed: Whether tanh of the network's numbers takes their place.
         middle: Action of an output 0, shape (1, k); the others likewise. None of them if discrete.
         half: What an output 1 adds to it.
         low: Lower bound of the action, float32; -inf where there is none.
@@ -137,7 +137,7 @@ class NetworkPolicy(Module):
 
     @property
     def layers(self) -> list[Layer]:
-        """From observations to numbers that a map without `squashed` takes."""
+        """Those of the network, and tanh where actions are squashed: what an export writes."""
         squashing = [Tanh()] if self.actions.squashed else []
         return [*self.network.layers, *squashing]
 

@@ -39,7 +39,8 @@ class PPOConfig(A2CConfig):
     max_grad_norm: Positive = 0.5
     """The gradient, as one vector, is scaled down to this length."""
     target_kl: Positive | None = None
-    """An update ends at a minibatch whose divergence is above 1.5 times it, nats; null: never."""
+    """An update ends at a minibatch whose divergence is above 1.5 times it, nats, as in SB3. Null:
+    never."""
 
 
 class PPO(A2C):
@@ -75,18 +76,18 @@ class PPO(A2C):
             axis = 1
             choices = np.flatnonzero(rollout.kept.any(axis=0))
         minibatches = min(config.minibatches, len(choices))
-        parts = (
-            part
+        draws = (
+            chosen
             for _ in range(config.epochs)
-            for part in np.array_split(self._rng.permutation(choices), minibatches)
+            for chosen in np.array_split(self._rng.permutation(choices), minibatches)
         )
         self._changes: list[Floats] = []
         terms = []
-        for chosen in parts:
+        for chosen in draws:
             some = [column.take(chosen, axis=axis) for column in columns]
             part = sequences.take(chosen) if sequences else None
             terms.append(self.minibatch(*some, sequences=part))
-            if config.target_kl and divergences(self._changes[-1]).mean() > 1.5 * config.target_kl:
+            if config.target_kl and divergence(self._changes[-1]) > 1.5 * config.target_kl:
                 break
             clip_norm(self.weights.slopes, config.max_grad_norm)
             self.optimizer.step(self.rate, scales)
@@ -94,7 +95,7 @@ class PPO(A2C):
         self.terms |= dict(zip(("gain", "entropy", "value_loss"), means, strict=True))
         changes = np.concatenate(self._changes)
         self.terms["clip_fraction"] = np.mean(np.abs(np.expm1(changes)) > config.clip)
-        self.terms["approx_kl"] = divergences(changes[-len(rollout) :]).mean()
+        self.terms["approx_kl"] = divergence(changes[-len(rollout) :])
 
     def columns(self, rollout: Rollout) -> list[Floats]:
         """As of A2C, and log-probabilities by the policy that flew."""
@@ -124,9 +125,9 @@ class PPO(A2C):
         return np.minimum(gains, ratio), gains * (gains <= ratio)
 
 
-def divergences(changes: Floats) -> Floats:
-    """Of KL, as SB3 estimates it from changes of the log-probability."""
-    return np.expm1(changes) - changes
+def divergence(changes: Floats) -> float:
+    """Of KL, nats, as SB3 estimates it from changes of log-probabilities."""
+    return float(np.mean(np.expm1(changes) - changes))
 
 
 class MAPPO(PPO):

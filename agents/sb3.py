@@ -156,10 +156,11 @@ class SB3Agent:
         if config.network != "mlp" or config.memory or config.reach:
             got = f"{config.network!r} with a memory of {config.memory} and reach {config.reach}"
             raise InputError(f"network: expected mlp without memory and reach with SB3, got {got}")
-        words = ("false", "true")
-        for name, own in {"anneal_clip": False, "squashed": isinstance(config, SACConfig)}.items():
+        needed = {"anneal_clip": False, "squashed": isinstance(config, SACConfig)}
+        for name, own in needed.items():
             if getattr(config, name) is not own:
-                raise InputError(f"{name}: expected {words[own]} with SB3, got {words[not own]}")
+                expected, got = ("true", "false") if own else ("false", "true")
+                raise InputError(f"{name}: expected {expected} with SB3, got {got}")
         if log.spec != log.spec.for_actor():
             raise InputError("sb3: expected no privileged arrays, which SB3's actor would see too")
         if any(scaled_in(log.spec.observation)):

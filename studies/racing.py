@@ -6,19 +6,20 @@
 
 Each seed is a training by `rotorgram train ppo` with `WORDS`, from process start to its end. Its
 policy, and `geometric`, fly `--flights` starts of the set `final`, on `rigid`: the same starts for
-all, of no training. Other seeds chose the words: 9100 to 9102, 9320 to 9339 and 9400 to 9411, on
-starts of the set `tuning`, and of Waypoints on those before `FIRST`. No test trains any of these.
-`--tasks Gates` flies through solid gates.
+all, of no training. Seeds 9100 to 9102 and 9400 to 9411 chose the words, on starts of the set
+`tuning`. Seeds 9320 to 9339 tried words that were given up, on starts of the set `final`; those of
+Waypoints are before `FIRST`. No test trains any of these. `--tasks Gates` flies through solid
+gates.
 
 A lap is the time from the start, at rest, to the end of the control step that passes the last gate
 or point. The bound of each flight is the least time of a point mass through the same openings or
 balls in their order, from the same start: see `least_time.py`. There, the least time of the craft
-itself is found, from flights of the first training. A crash is an end with gates or points
+itself is found from flights of the first training. A crash is an end with gates or points
 left before the time is up.
 
 Rows of all flights are kept in the file beside the result, `racing_flights.npz`. Seeds that it has
-with as many flights are not trained again. `--again` computes the figures from the rows and flies
-nothing.
+by the same words, starts and number of flights are not trained again. `--again` computes the
+figures from the rows and flies nothing.
 
 It takes about an hour of one core for both courses in the air.
 """
@@ -244,7 +245,7 @@ def main() -> None:
     kept: Rows = dict(np.load(path)) if path.exists() else {}
     tasks = [] if args.again else args.tasks
     for task in tasks:
-        if kept.get(f"{task}/made") != made_by(task, args.flights):
+        if str(kept.get(f"{task}/made")) != made_by(task, args.flights):
             begin(kept, task, args.flights)
             np.savez_compressed(path, **kept)
     for seed in range(args.first_seed, args.first_seed + args.seeds):

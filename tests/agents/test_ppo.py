@@ -61,7 +61,7 @@ def test_squashed_actions_are_flown_by_tanh_with_noise_and_without() -> None:
 
 
 def test_an_update_ends_at_a_minibatch_that_is_too_far() -> None:
-    """The first minibatch is of the policy that flew, and the second one beyond any bound."""
+    """The divergence of the first minibatch is 0: the policy is still the one that flew."""
     config = replace(SMALL, steps_per_update=90, epochs=3, minibatches=4, learning_rate=0.1)
     steps = []
     for most in (None, 10.0, 1e-6):
