@@ -11,6 +11,7 @@ from ...sim import Array, Draw, InitialState, clip, cos, length, looked_up, sin,
 from ..spec import Metric
 from ..state import State
 from .goal import (
+    HEADING_WEIGHT,
     MAX_SPEED,
     POSITION_ERROR,
     WORST_RATES,
@@ -23,13 +24,14 @@ from .goal import (
     Speed,
     along,
     check_height,
+    heading_cost,
     nearness,
 )
 from .task import Outcome, TaskOptions
 
 MAX_DRONES = 128
 APPROACH_WEIGHT = 0.1  # Of a speed of 1 m/s towards the goal, in each step
-ROOM_WEIGHT = 0.5  # Cost of spheres that touch; nothing from a diameter apart on
+WORST_ROOM = 1.5  # Cost of centres that meet; of spheres that touch 1, two diameters apart 0
 TINY = 1e-9  # m
 JITTER = 0.2  # Of a start, in each axis, over the distance between starts
 
@@ -76,7 +78,7 @@ class Swarm(GoalTask):
     has_radio = True
     action = "velocity"
     episode_length = 500
-    worst_step = -1.0 - 2 * ROOM_WEIGHT + WORST_RATES
+    worst_step = -1.0 - WORST_ROOM - HEADING_WEIGHT + WORST_RATES
     reach = 0.0
     """Furthest distance of a start from its goal, m."""
 
@@ -152,6 +154,7 @@ class Swarm(GoalTask):
             "position": nearness(distance, self.gap / 2),
             "approach": approach(to_goal, state.velocity - self.goal_velocity()),
             "room": self.proximity_penalty(room),
+            "heading": heading_cost(self.heading_error(state)),
         }
         metrics = {"position_error": distance, "clearance": room}
         return self.judged(state, terms, self.ended(state), metrics)
@@ -170,9 +173,8 @@ class Swarm(GoalTask):
         return (apart - (self._radii[:, None] + self._radii)).min(axis=-1)
 
     def proximity_penalty(self, room: Array) -> Array:
-        """Reward for a clearance, (W, A): 0 from a diameter on, `-ROOM_WEIGHT` where it is 0."""
-        narrow = clip(1.0 - room / (2 * self._radii), 0.0, 2.0)
-        return -ROOM_WEIGHT * narrow
+        """Reward for a clearance, (W, A): 0 from two diameters on, -1 where spheres touch."""
+        return -clip(1.0 - room / (4 * self._radii), 0.0, WORST_ROOM)
 
     def goal(self, state: State) -> Array:
         """The slot of each drone."""
@@ -245,9 +247,10 @@ class Formation(Swarm):
     ## Reward
 
     (s - d) / (s + d) for the distance d to the own place, where s is half the distance between
-    neighbouring starts; 0.1 s/m times the speed towards it; -0.02 s/rad times the size of the body
-    rates, up to 20 rad/s; with less than a diameter between the drone's sphere and another, down to
-    -0.5 where they touch and -1 where their centres meet; and -240 on the step that terminates.
+    neighbouring starts; 0.1 s/m times the speed towards it; -0.2 |heading error| / 180°; -0.02
+    s/rad times the size of the body rates, up to 20 rad/s; with less than two diameters between the
+    drone's sphere and another, down to -1 where they touch and -1.5 where their centres meet; and
+    -310 on the step that terminates.
 
     ## Start, termination, truncation
 
@@ -287,9 +290,10 @@ class Crossing(Swarm):
     ## Reward
 
     (s - d) / (s + d) for the distance d to the goal, where s is half the distance between
-    neighbouring starts; 0.1 s/m times the speed towards it; -0.02 s/rad times the size of the body
-    rates, up to 20 rad/s; with less than a diameter between the drone's sphere and another, down to
-    -0.5 where they touch and -1 where their centres meet; and -240 on the step that terminates.
+    neighbouring starts; 0.1 s/m times the speed towards it; -0.2 |heading error| / 180°; -0.02
+    s/rad times the size of the body rates, up to 20 rad/s; with less than two diameters between the
+    drone's sphere and another, down to -1 where they touch and -1.5 where their centres meet; and
+    -310 on the step that terminates.
 
     ## Start, termination, truncation
 
@@ -361,10 +365,10 @@ class Escort(Swarm):
     ## Reward
 
     (s - d) / (s + d) for the distance d to the own place, where s is half the distance between
-    neighbouring starts; 0.1 s/m times the speed towards it, relative to it; -0.02 s/rad times the
-    size of the body rates, up to 20 rad/s; with less than a diameter between the drone's sphere and
-    another, down to -0.5 where they touch and -1 where their centres meet; and -240 on the step
-    that terminates.
+    neighbouring starts; 0.1 s/m times the speed towards it, relative to it; -0.2 |heading error| /
+    180°; -0.02 s/rad times the size of the body rates, up to 20 rad/s; with less than two diameters
+    between the drone's sphere and another, down to -1 where they touch and -1.5 where their centres
+    meet; and -310 on the step that terminates.
 
     ## Start, termination, truncation
 

@@ -190,7 +190,7 @@ def test_a_crash_ends_the_episode_of_those_that_touch_and_they_fall_silent() -> 
     env.advance(actions)
     assert env.terminated.tolist() == [True, True, False]
     assert env.done.tolist() == [False] * 3
-    assert env.loop.told()()[1]["termination"] == pytest.approx([-240, -240, 0])
+    assert env.loop.told()()[1]["termination"] == pytest.approx([-310, -310, 0])
     for _ in range(60):  # longer than a second
         env.advance(actions)
     third = env.observations.reshape(3, -1)[2]
