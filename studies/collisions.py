@@ -8,7 +8,8 @@ with the preset of the task: of Formation with as many drones as fly, each for 9
 Crossing with eight and of Escort with four for each number. The clock runs from before the process
 starts to after it has ended. They fly whole episodes of the task, from starts that no training has
 seen, on `mujoco`. ORCA flies some starts of that kind. Seeds 100 to 102 and 860 to 866 chose the
-presets.
+presets. Formation of eight has seeds from 805 on (`--tasks Formation --drones 8 --first-seed 805`):
+800 and 801 flew a shorter training of it first.
 `docs/results/collisions_flights.npz` gets the steady error of every flight in millimetres, 65535 of
 one that crashed, from which `--only-sums` computes `docs/results/collisions.json` again. Flights of
 other tasks stay in it.

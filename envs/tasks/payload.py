@@ -27,7 +27,6 @@ from .goal import (
     at,
     check_cube,
     check_height,
-    heading_cost,
     nearness,
 )
 from .swarm import Swarm, SwarmOptions, angles, approach, on_circle, ring, shared
@@ -213,10 +212,9 @@ class Cable(Swarm):
 
     (s - d) / (s + d) for the distance d of the payload to the goal, where s is half the distance
     between neighbouring drones; 0.1 s/m times the speed of the payload towards it; -0.1 s/m times
-    the speed of the payload relative to the drone, up to 4 m/s; -0.2 |heading error| / 180°; -0.02
-    s/rad times the size of the body rates, up to 20 rad/s; with less than two diameters between the
-    drone's sphere and another, down to -1 where they touch and -1.5 where their centres meet; and
-    -350 on the step that terminates.
+    the speed of the payload relative to the drone, up to 4 m/s; -0.02 s/rad times the size of the
+    body rates, up to 20 rad/s; with less than two diameters between the drone's sphere and another,
+    down to -1 where they touch; and -350 on the step that terminates.
 
     ## Start, termination, truncation
 
@@ -351,7 +349,6 @@ class Cable(Swarm):
             "approach": approach(missing, state.payload_velocity),
             "swing": swing_cost(state),
             "room": self.proximity_penalty(room),
-            "heading": heading_cost(self.heading_error(state)),
         }
         metrics = {"payload_error": distance, "clearance": room}
         return self.judged(state, terms, self.ended(state), metrics)

@@ -31,7 +31,6 @@ from .task import Outcome, TaskOptions
 
 MAX_DRONES = 128
 APPROACH_WEIGHT = 0.1  # Of a speed of 1 m/s towards the goal, in each step
-WORST_ROOM = 1.5  # Cost of centres that meet; of spheres that touch 1, two diameters apart 0
 TINY = 1e-9  # m
 JITTER = 0.2  # Of a start, in each axis, over the distance between starts
 
@@ -78,7 +77,9 @@ class Swarm(GoalTask):
     has_radio = True
     action = "velocity"
     episode_length = 500
-    worst_step = -1.0 - WORST_ROOM - HEADING_WEIGHT + WORST_RATES
+    worst_step = -2.5 - HEADING_WEIGHT + WORST_RATES
+    space = 4.0
+    """Clearance below which another drone costs, in radii."""
     reach = 0.0
     """Furthest distance of a start from its goal, m."""
 
@@ -173,8 +174,8 @@ class Swarm(GoalTask):
         return (apart - (self._radii[:, None] + self._radii)).min(axis=-1)
 
     def proximity_penalty(self, room: Array) -> Array:
-        """Reward for a clearance, (W, A): 0 from two diameters on, -1 where spheres touch."""
-        return -clip(1.0 - room / (4 * self._radii), 0.0, WORST_ROOM)
+        """Reward for a clearance, (W, A): `-space / 4` where spheres touch, 0 from `space` on."""
+        return -self.space / 4 * clip(1.0 - room / (self.space * self._radii), 0.0, 1.5)
 
     def goal(self, state: State) -> Array:
         """The slot of each drone."""
@@ -249,8 +250,7 @@ class Formation(Swarm):
     (s - d) / (s + d) for the distance d to the own place, where s is half the distance between
     neighbouring starts; 0.1 s/m times the speed towards it; -0.2 |heading error| / 180°; -0.02
     s/rad times the size of the body rates, up to 20 rad/s; with less than two diameters between the
-    drone's sphere and another, down to -1 where they touch and -1.5 where their centres meet; and
-    -310 on the step that terminates.
+    drone's sphere and another, down to -1 where they touch; and -310 on the step that terminates.
 
     ## Start, termination, truncation
 
@@ -291,9 +291,9 @@ class Crossing(Swarm):
 
     (s - d) / (s + d) for the distance d to the goal, where s is half the distance between
     neighbouring starts; 0.1 s/m times the speed towards it; -0.2 |heading error| / 180°; -0.02
-    s/rad times the size of the body rates, up to 20 rad/s; with less than two diameters between the
-    drone's sphere and another, down to -1 where they touch and -1.5 where their centres meet; and
-    -310 on the step that terminates.
+    s/rad times the size of the body rates, up to 20 rad/s; with less than a diameter between the
+    drone's sphere and another, down to -0.5 where they touch, as all have to meet; and -310 on the
+    step that terminates.
 
     ## Start, termination, truncation
 
@@ -308,6 +308,7 @@ class Crossing(Swarm):
 
     Options = SwarmOptions
     episode_length = 1000
+    space = 2.0
 
     def setup(self) -> None:
         """See the class."""
@@ -367,8 +368,8 @@ class Escort(Swarm):
     (s - d) / (s + d) for the distance d to the own place, where s is half the distance between
     neighbouring starts; 0.1 s/m times the speed towards it, relative to it; -0.2 |heading error| /
     180°; -0.02 s/rad times the size of the body rates, up to 20 rad/s; with less than two diameters
-    between the drone's sphere and another, down to -1 where they touch and -1.5 where their centres
-    meet; and -310 on the step that terminates.
+    between the drone's sphere and another, down to -1 where they touch; and -310 on the step that
+    terminates.
 
     ## Start, termination, truncation
 
