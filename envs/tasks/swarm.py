@@ -42,7 +42,8 @@ class SwarmOptions(TaskOptions):
     center: Point = (0.0, 0.0, 10.0)
     """Middle of starts and goals: x, y, z in MuJoCo's world frame (z up), m."""
     spacing: Annotated[float, Limits(2.0, 1e3, "diameters")] = 3.0
-    """Distance between neighbouring starts, and goals, over the diameter of the vehicle."""
+    """Distance between neighbouring starts, and goals, over the diameter of the vehicle. Below 3,
+    drones at their goals may be so near each other that it costs reward."""
     margin: Margin = 10.0
     """An episode terminates for a drone that is so much further from its goal than any start, m."""
     neighbours: Annotated[int, Limits(0, 16, "drones", whole=True)] = 7
@@ -145,8 +146,8 @@ class Swarm(GoalTask):
         return self.crashed(state, self.distance(state) > self.band)
 
     def outcome(self, state: State) -> Outcome:
-        """Nearness to the goal, approach and room; the end at a crash, a flip-over, or outside the
-        band.
+        """Nearness to the goal, approach, room and heading; the end at a crash, a flip-over, or
+        outside the band.
         """
         to_goal = self.goal(state) - state.position
         distance = length(to_goal)
@@ -250,7 +251,8 @@ class Formation(Swarm):
     (s - d) / (s + d) for the distance d to the own place, where s is half the distance between
     neighbouring starts; 0.1 s/m times the speed towards it; -0.2 |heading error| / 180°; -0.02
     s/rad times the size of the body rates, up to 20 rad/s; with less than two diameters between the
-    drone's sphere and another, down to -1 where they touch; and -310 on the step that terminates.
+    drone's sphere and another, -1 where they touch, at most -1.5; and -310 on the step that
+    terminates.
 
     ## Start, termination, truncation
 
@@ -292,8 +294,8 @@ class Crossing(Swarm):
     (s - d) / (s + d) for the distance d to the goal, where s is half the distance between
     neighbouring starts; 0.1 s/m times the speed towards it; -0.2 |heading error| / 180°; -0.02
     s/rad times the size of the body rates, up to 20 rad/s; with less than a diameter between the
-    drone's sphere and another, down to -0.5 where they touch, as all have to meet; and -310 on the
-    step that terminates.
+    drone's sphere and another, -0.5 where they touch, at most -0.75, as all have to meet; and -310
+    on the step that terminates.
 
     ## Start, termination, truncation
 
@@ -368,8 +370,8 @@ class Escort(Swarm):
     (s - d) / (s + d) for the distance d to the own place, where s is half the distance between
     neighbouring starts; 0.1 s/m times the speed towards it, relative to it; -0.2 |heading error| /
     180°; -0.02 s/rad times the size of the body rates, up to 20 rad/s; with less than two diameters
-    between the drone's sphere and another, down to -1 where they touch; and -310 on the step that
-    terminates.
+    between the drone's sphere and another, -1 where they touch, at most -1.5; and -310 on the step
+    that terminates.
 
     ## Start, termination, truncation
 

@@ -121,14 +121,16 @@ def test_the_tuned_preset_depends_on_the_task() -> None:
     other = find_preset("ppo", "tuned", "other/Task-v0")
     assert other == replace(ours, fits=False, backend=None)  # it may need contact
     swarm = find_preset("ippo", "tuned", "rotorgram/Formation-v0")
-    assert (swarm.num_envs, swarm.env_steps, swarm.backend) == (1024, 8_000_000, "rigid")
+    assert (swarm.num_envs, swarm.env_steps, swarm.backend) == (1024, 36_000_000, "rigid")
     assert swarm.episode_length == 100
-    assert swarm.config.reward_clip is None  # a crash has its full cost
+    assert swarm.config.anneal_clip  # the cost of a crash grows
     for algorithm in ("ppo", "mappo"):
         for task, most, squashed in (("Crossing", 2.0, True), ("Escort", 8.0, False)):
             other = find_preset(algorithm, "tuned", f"rotorgram/{task}-v0")
-            changes = {"reward_clip": most, "anneal_clip": True, "squashed": squashed}
+            changes = {"reward_clip": most, "log_std": -2.5, "squashed": squashed}
             assert other.config == replace(swarm.config, **changes)
+    slower = find_preset("mappo", "tuned", "rotorgram/Formation-v0")
+    assert slower.env_steps == 8_000_000
     with pytest.raises(InputError, match="preset: expected robust or tuned for ppo, got 'paper'"):
         find_preset("ppo", "paper")
 
