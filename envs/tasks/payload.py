@@ -214,7 +214,7 @@ class Cable(Swarm):
     between neighbouring drones; 0.1 s/m times the speed of the payload towards it; -0.1 s/m times
     the speed of the payload relative to the drone, up to 4 m/s; -0.02 s/rad times the size of the
     body rates, up to 20 rad/s; with less than two diameters between the drone's sphere and another,
-    -1 where they touch, at most -1.5; and -350 on the step that terminates.
+    -1 where they touch, -1.5 at worst; and -350 on the step that terminates.
 
     ## Start, termination, truncation
 

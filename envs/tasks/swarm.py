@@ -78,7 +78,7 @@ class Swarm(GoalTask):
     has_radio = True
     action = "velocity"
     episode_length = 500
-    worst_step = -2.5 - HEADING_WEIGHT + WORST_RATES
+    worst_step = -2.5 - HEADING_WEIGHT + WORST_RATES  # -1 as far away as can be, -1.5 of room
     space = 4.0
     """Clearance below which another drone costs, in radii."""
     reach = 0.0
@@ -251,7 +251,7 @@ class Formation(Swarm):
     (s - d) / (s + d) for the distance d to the own place, where s is half the distance between
     neighbouring starts; 0.1 s/m times the speed towards it; -0.2 |heading error| / 180°; -0.02
     s/rad times the size of the body rates, up to 20 rad/s; with less than two diameters between the
-    drone's sphere and another, -1 where they touch, at most -1.5; and -310 on the step that
+    drone's sphere and another, -1 where they touch, -1.5 at worst; and -310 on the step that
     terminates.
 
     ## Start, termination, truncation
@@ -294,8 +294,8 @@ class Crossing(Swarm):
     (s - d) / (s + d) for the distance d to the goal, where s is half the distance between
     neighbouring starts; 0.1 s/m times the speed towards it; -0.2 |heading error| / 180°; -0.02
     s/rad times the size of the body rates, up to 20 rad/s; with less than a diameter between the
-    drone's sphere and another, -0.5 where they touch, at most -0.75, as all have to meet; and -310
-    on the step that terminates.
+    drone's sphere and another, -0.5 where they touch, -0.75 at worst: half as much and as far as in
+    the other tasks, since all have to meet; and -310 on the step that terminates.
 
     ## Start, termination, truncation
 
@@ -370,7 +370,7 @@ class Escort(Swarm):
     (s - d) / (s + d) for the distance d to the own place, where s is half the distance between
     neighbouring starts; 0.1 s/m times the speed towards it, relative to it; -0.2 |heading error| /
     180°; -0.02 s/rad times the size of the body rates, up to 20 rad/s; with less than two diameters
-    between the drone's sphere and another, -1 where they touch, at most -1.5; and -310 on the step
+    between the drone's sphere and another, -1 where they touch, -1.5 at worst; and -310 on the step
     that terminates.
 
     ## Start, termination, truncation

@@ -180,6 +180,23 @@ def test_pettingzoos_own_tests(env_id: str) -> None:
     parallel_seed_test(lambda: LocalParallelEnv(env_id, 2, episode_length=30))
 
 
+@pytest.mark.parametrize(("env_id", "touch"), list(zip(TASKS, (-1.0, -0.5, -1.0), strict=True)))
+def test_room_and_heading_cost_what_the_class_says(env_id: str, touch: float) -> None:
+    env = LocalVectorEnv(env_id, 3, drones=3, vehicle="crazyflie2")
+    env.reset(seed=0)
+    radius = Vehicle.load("crazyflie2").radius
+    task: Any = env.loop.task
+    clear = -touch * 4 * radius  # a diameter or two
+    room = task.proximity_penalty(np.array([[0.0, clear / 2, clear], [-clear, -1.0, 1.0]]))
+    assert room[0] == pytest.approx([touch, touch / 2, 0.0])
+    assert room[1] == pytest.approx([1.5 * touch, 1.5 * touch, 0.0])
+    env.loop.world.state.quaternion[0] = [
+        (np.cos(angle / 2), 0.0, 0.0, np.sin(angle / 2)) for angle in np.radians([0, 90, -180])
+    ]
+    env.advance(zero_actions(3, 4))
+    assert env.loop.told()()[1]["heading"] == pytest.approx([0.0, -0.1, -0.2], abs=1e-3)
+
+
 def test_a_crash_ends_the_episode_of_those_that_touch_and_they_fall_silent() -> None:
     env = LocalVectorEnv(TASKS[1], 3, drones=3, autoreset_mode="Disabled", spacing=2.0)
     env.reset(seed=4)
