@@ -58,6 +58,8 @@ def _read(table: object, where: str) -> Values:
         rule = Text(**row["rule"]) if "pattern" in row["rule"] else Limits(**row["rule"])
         if name in given or "default" not in row:
             event[name] = check(f"{where}.{name}", rule, given.get(name))
+    if event.keys().isdisjoint(KINDS[kind]):
+        raise InputError(f"{where}: expected {' or '.join(KINDS[kind])}, got neither")
     return event
 
 
@@ -105,8 +107,7 @@ def check_events(config: "EnvConfig") -> None:
     """Refuse by name what an env has not. Raises `InputError`."""
     for number, event in enumerate(config.events):
         where = f"events[{number}]"
-        drones = Limits(0, config.drones - 1, whole=True)
-        check(f"{where}.drone", drones, event.get("drone", 0))
+        check(f"{where}.drone", Limits(0, config.drones - 1, whole=True), event.get("drone", 0))
         sensor = event.get("sensor")
         if sensor and sensor not in config.sensors:
             raise InputError(f"{where}: expected a sensor of the env, got {sensor}, which is off")

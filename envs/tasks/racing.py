@@ -203,8 +203,7 @@ class Racing(GoalTask):
         position = np.array(self._start.position) + offset
         half = math.radians(self._start.heading) / 2
         zero = 0.0 * offset[..., 0]
-        turn = stack((zero + cos(half), zero, zero, zero + sin(half)))
-        return self.start(position, turn)
+        return self.start(position, stack((zero + cos(half), zero, zero, zero + sin(half))))
 
     def start(self, position: Array, turn: Array) -> InitialState:
         """A start at rest, m, and its quaternion, (W, A, 4), with the memory of a race."""
@@ -259,8 +258,10 @@ class Racing(GoalTask):
         vectors = [gate[..., 3:5], way, after[..., 3:5]]
         if self.body:
             level = 0.0 * way[..., :1]
-            vectors = [np.concat((vector, level), axis=-1)[..., :3] for vector in vectors]
-            vectors = [self.framed(state, vector) for vector in vectors]
+            vectors = [
+                self.framed(state, np.concat((vector, level), axis=-1)[..., :3])
+                for vector in vectors
+            ]
         return *vectors, gate[..., 5:]
 
     def outcome(self, state: State) -> Outcome:

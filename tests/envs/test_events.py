@@ -377,6 +377,8 @@ WRONG: list[tuple[str, Any]] = [
         [{"kind": "mass", "when": "height > 1", "mass": 1.0}],
     ),
     (r"events\[0\].drone: .* 0 to 0, got 1", [{"kind": "mass", "at": 0, "mass": 1, "drone": 1}]),
+    (r"events\[0\]: expected impulse or turn, got neither", [{"kind": "kick", "at": 0}]),
+    (r"events\[0\]: expected delay or outage, got neither", [{"kind": "link", "at": 0}]),
     ("thrust_5: expected one of the 4 rotors", [{"kind": "rotor", "at": 0, "rotor": 5}]),
     (
         r"events\[0\]: expected a sensor of the env, got imu, which is off",
