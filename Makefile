@@ -24,7 +24,7 @@ test: lint types docs
 # AVX-512) and in the plainest locale.
 test-other-processor: .venv/.dev
 	OPENBLAS_CORETYPE=Haswell ATEN_CPU_CAPABILITY=avx2 LC_ALL=C OMP_NUM_THREADS=1 \
-	  $(BIN)/python -m pytest -m "not quiet" -n auto --dist loadfile tests/agents tests/sim tests/envs/test_compiled.py
+	  $(BIN)/python -m pytest -m "not quiet" -n auto --dist worksteal tests/agents tests/sim tests/envs/test_compiled.py
 
 # The wheel, installed without extras into an empty environment, flies from a folder outside of the
 # checkout.
