@@ -4,17 +4,17 @@
         [--first-seed 800] [--flights 1000] [--orca-flights 200] [--only-sums]
 
 For each task, number of drones and seed `rotorgram train ippo --env.neighbours 3` trains a policy
-with the preset of the task: with as many drones as fly, each for 9,000,000 steps, but Crossing
-with eight, whatever number flies. The clock runs from before the process starts to after it has
-ended. The policies fly whole episodes of the task, from starts that no training has seen, on
-`mujoco`. ORCA flies some starts of that kind. Seeds 100 to 102 and 860 to 866 chose the presets.
-Formation of eight has seeds from 805 on (`--tasks Formation --drones 8 --first-seed 805`), Escort
-from 810 on (`--tasks Escort --first-seed 810`): those before first flew with earlier presets.
-`docs/results/collisions_flights.npz` gets the steady error of every flight in millimetres, 65535 of
-one that crashed, from which `--only-sums` computes `docs/results/collisions.json` again. Flights of
-other tasks stay in it.
+with the preset of the task, with as many drones as fly, each for 9,000,000 steps. Crossing trains
+once with eight drones, for the preset's steps, whatever number flies. The clock runs from before
+the process starts to after it has ended. The policies fly whole episodes of the task, from starts
+that no training has seen, on `mujoco`. ORCA flies some starts of that kind. Seeds 100 to 102 and
+860 to 866 chose the presets. Formation of eight has seeds from 805 on (`--tasks Formation --drones
+8 --first-seed 805`), Escort from 810 on (`--tasks Escort --first-seed 810`): those before first
+flew with earlier presets. `docs/results/collisions_flights.npz` gets the steady error of every
+flight in millimetres, 65535 of one that crashed, from which `--only-sums` computes
+`docs/results/collisions.json` again. Flights of other tasks stay in it.
 
-It takes more than an hour on two cores.
+It takes about two hours.
 """
 
 import subprocess
@@ -41,7 +41,7 @@ NEIGHBOURS = 3
 TRAINED = {"Crossing": 8}
 """Drones of a world in training, by task; of other tasks as many as fly."""
 STEPS = 9_000_000
-"""Env steps of each of these drones; where `TRAINED` has the task, in all as in the preset."""
+"""Env steps of each drone; where `TRAINED` has the task, those of the preset in all."""
 CRASHED = 65535
 
 
